@@ -1,0 +1,308 @@
+"""Whole files, written atomically: the only module of the package that writes any.
+
+A file is never appended to and never changed in place. The new content goes to a temporary file in the same folder, is
+flushed to the disk, takes the name of the old file in one step, and the folder is flushed. Whatever kills the process
+at whatever moment, a reader finds the old file or the new one, each whole. When a step fails the old file is back, the
+temporary file is gone, and the error names the file.
+
+A temporary file which a killed process left behind is removed by the next save of the same file.
+"""
+
+import errno
+import fcntl
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+LOCK_NAME = ".lock"
+TEMPORARY_PREFIX = ".tmp"
+
+_counter = itertools.count()
+_held_locks: set[int] = set()
+
+
+class DamagedFileError(ValueError):
+    """A file that cannot be trusted: cut off, changed, missing or not what its name promises.
+
+    :param path: the file
+    :param reason: what is wrong with it, in words
+    """
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path = Path(path)
+        self.reason = reason
+
+
+class FolderLockedError(RuntimeError):
+    """Another process works in the folder.
+
+    :param folder: the folder
+    :param pid: process which holds the lock; None in the instant before it has written it down
+    :param host: the machine that process runs on
+    """
+
+    def __init__(self, folder: str | Path, pid: int | None, host: str | None) -> None:
+        holder = "another process" if pid is None else f"process {pid} on host {host}"
+        super().__init__(f"{folder}: {holder} works in this folder; wait for it to end or choose another folder")
+        self.folder = Path(folder)
+        self.pid = pid
+        self.host = host
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file (UTF-8, line ends as given) as a whole.
+
+    :param path: the file; missing folders are made
+    :param text: its new content
+    :raises OSError: with the file's name; the old file is unchanged
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: str | Path, value: object) -> None:
+    """Write a value as indented JSON, keys in the order given.
+
+    :param path: the file; missing folders are made
+    :param value: dicts, lists, strings, finite numbers, booleans, None
+    :raises ValueError: for nan and infinity, which are not JSON
+    :raises TypeError: for values that JSON does not know
+    :raises OSError: with the file's name; the old file is unchanged
+    """
+    write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file as a whole.
+
+    :param path: the file; missing folders are made
+    :param data: its new content
+    :raises OSError: with the file's name; the old file is unchanged
+    """
+    with atomic_path(path) as temporary:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes ``path`` when the block ends without an error.
+
+    For libraries that insist on writing themselves. The temporary path has the suffix of ``path``, by which many choose
+    the format.
+
+    :param path: the file to be written; missing folders are made
+    :raises OSError: with the file's name, also for errors of the block; the old file is unchanged
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{_temporary_stem()}-{next(_counter)}-{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(path)
+        yield temporary
+        _sync(temporary)
+        _replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror or str(error) or type(error).__name__
+        raise OSError(error.errno or errno.EIO, f"not saved: {reason}", str(path)) from error
+    finally:
+        with suppress(OSError):  # the error under way says more than this one
+            temporary.unlink(missing_ok=True)
+
+
+def _temporary_stem() -> str:
+    """Start of this process's temporary names: whose they are, so that only a dead process's are swept away."""
+    return f"{TEMPORARY_PREFIX}-{socket.gethostname()}-{os.getpid()}"
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files of ``path`` whose process on this host has died."""
+    start = f"{TEMPORARY_PREFIX}-{socket.gethostname()}-"
+    with os.scandir(path.parent) as entries:
+        names = [
+            entry.name for entry in entries if entry.name.startswith(start) and entry.name.endswith(f"-{path.name}")
+        ]
+    for name in names:
+        pid, _, rest = name.removeprefix(start).partition("-")
+        number, _, owner = rest.partition("-")
+        if owner == path.name and pid.isdigit() and number.isdigit() and not _alive(int(pid)):
+            path.with_name(name).unlink(missing_ok=True)
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process of this number runs on this host."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _sync(path: Path) -> None:
+    """Flush a file or folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Give ``temporary`` the name ``path``, for good or not at all."""
+    with _former(path) as former:
+        temporary.replace(path)
+        try:
+            _sync(path.parent)
+        except OSError as error:
+            try:
+                _restore(former, temporary, path)
+            except OSError as second:
+                reason = f"{second.strerror}; nor could the disk confirm the new content, which is in place"
+                raise OSError(second.errno, f"the former content cannot be put back: {reason}") from error
+            raise
+
+
+@contextmanager
+def _former(path: Path) -> Iterator[BinaryIO | None]:
+    """Open the file of that name; the handle outlives the name. None where there is no file."""
+    try:
+        handle = path.open("rb")
+    except FileNotFoundError:
+        yield None
+        return
+    with handle:
+        yield handle
+
+
+def _restore(former: BinaryIO | None, temporary: Path, path: Path) -> None:
+    """Undo a replacement that the disk did not confirm."""
+    if former is None:
+        path.unlink(missing_ok=True)
+        return
+    with temporary.open("wb") as copy:
+        shutil.copyfileobj(former, copy)
+    with suppress(OSError):  # a disk that flushes nothing any more still takes the name back
+        _sync(temporary)
+    temporary.replace(path)
+
+
+def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | None = None) -> bytes:
+    """Read a file that somebody else may have changed.
+
+    :param path: the file
+    :param sha256: what it must hash to, in hexadecimal
+    :param max_bytes: size above which it is refused unread
+    :return: its content
+    :raises DamagedFileError: when it is missing, too large or not what was written
+    """
+    path = Path(path)
+    limit = -1 if max_bytes is None else max_bytes + 1
+    try:
+        with path.open("rb") as file:
+            data = file.read(limit)
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        raise DamagedFileError(path, "the file is missing") from error
+    if max_bytes is not None and len(data) > max_bytes:
+        raise DamagedFileError(path, f"larger than the {max_bytes} bytes allowed")
+    if sha256 is not None and sha256_bytes(data) != sha256:
+        raise DamagedFileError(
+            path, f"changed since it was written: sha256 {sha256_bytes(data)}, written as {sha256[:80]}"
+        )
+    return data
+
+
+def sha256_bytes(data: bytes) -> str:
+    """SHA-256 of bytes, in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: str | Path) -> str:
+    """SHA-256 of a file, in hexadecimal, read in pieces."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def folder_lock(folder: str | Path) -> Iterator[None]:
+    """Keep a folder to this process while the block runs.
+
+    The lock is the kernel's, on the file ``.lock``: it falls when the process dies in whatever way, so a dead one's is
+    taken over without guessing from process numbers. The file only says who holds it. Forked children do not hold it.
+
+    :param folder: the folder; made if missing
+    :raises FolderLockedError: another process (or another block of this one) holds it, with its pid and host
+    :raises OSError: with the name of the lock file
+    """
+    path = Path(folder) / LOCK_NAME
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = _acquire(path)
+    except OSError as error:
+        raise OSError(error.errno, f"the folder cannot be locked: {error.strerror or error}", str(path)) from error
+    try:
+        yield
+    finally:
+        if descriptor in _held_locks:  # not so in a forked child that leaves the block
+            with suppress(OSError):  # a folder that has vanished takes its lock along
+                path.unlink(missing_ok=True)
+            _held_locks.discard(descriptor)
+            os.close(descriptor)
+
+
+def _acquire(path: Path) -> int:
+    """Lock the file of that name and write down who holds it; returns the open descriptor."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _still_named(descriptor, path):  # else its former holder removed it between our open and our lock
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+                _held_locks.add(descriptor)
+                return descriptor
+        except BlockingIOError:
+            raise FolderLockedError(path.parent, *_parse_holder(os.pread(descriptor, 1024, 0))) from None
+        finally:
+            if descriptor not in _held_locks:
+                os.close(descriptor)
+
+
+def _still_named(descriptor: int, path: Path) -> bool:
+    """Whether the open file is the one that has the name."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _parse_holder(data: bytes) -> tuple[int | None, str | None]:
+    """Pid and host from a lock file; None for both while its holder has not written them yet."""
+    try:
+        holder = json.loads(data)
+        return int(holder["pid"]), str(holder["host"])[:80]
+    except (ValueError, TypeError, KeyError):
+        return None, None
+
+
+def _let_go_in_child() -> None:
+    """Close inherited locks after a fork; the parent keeps them, and its death alone frees them."""
+    for descriptor in _held_locks:
+        os.close(descriptor)
+    _held_locks.clear()
+
+
+os.register_at_fork(after_in_child=_let_go_in_child)
