@@ -1,14 +1,15 @@
 import errno
+import fcntl
 import json
-import multiprocessing
 import os
 import random
 import resource
+import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -323,20 +324,45 @@ def test_one_process_cannot_hold_a_folder_twice_and_can_take_it_again(tmp_path: 
         pass
 
 
-def wait_in_child(release: Callable[[], object]) -> None:
-    release()
+HOLD_LOCK_AND_FORK = """
+import os, time
+with files["folder_lock"](sys.argv[2]):
+    child = os.fork()
+    if child:
+        print(child, flush=True)
+    time.sleep(60)
+"""
 
 
-def test_a_forked_child_does_not_keep_its_parents_lock(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
-    event = context.Event()
-    with files.folder_lock(tmp_path):
-        child = context.Process(target=wait_in_child, args=(event.wait,))
-        child.start()
-    with files.folder_lock(tmp_path):
-        assert child.is_alive()
-    event.set()
-    child.join()
+def test_a_dead_ones_lock_is_taken_over_while_its_forked_child_lives(tmp_path: Path) -> None:
+    with subprocess.Popen(run_module(HOLD_LOCK_AND_FORK, tmp_path), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        try:
+            with pytest.raises(files.FolderLockedError, match=str(process.pid)), files.folder_lock(tmp_path):
+                pass
+            process.kill()
+            process.wait()
+            os.kill(child, 0)
+            with files.folder_lock(tmp_path):
+                pass
+        finally:
+            os.kill(child, signal.SIGKILL)
+
+
+def test_a_lock_whose_holder_removed_it_just_now_is_not_taken_for_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = fcntl.flock, iter(range(1_000))
+
+    def flock(descriptor: int, operation: int) -> None:
+        if next(calls) == 0:
+            (tmp_path / ".lock").unlink()
+        real(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError), files.folder_lock(tmp_path):
+        pass
 
 
 def test_a_lock_that_says_nothing_readable_still_locks(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
