@@ -1,0 +1,506 @@
+"""Multi-Agent Deep Deterministic Policy Gradient."""
+
+import io
+import pathlib
+import warnings
+from collections.abc import Sequence
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    ReplayBufferSamples,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.common.utils import FloatSchedule, should_collect_more_steps
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+from torch import nn
+
+from marl_encircle.maddpg.buffers import JointReplayBuffer
+from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
+
+SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
+
+
+class UntrustedFileWarning(UserWarning):
+    """A file that can run code is about to be read."""
+
+
+class MADDPG(OffPolicyAlgorithm):
+    """Multi-Agent Deep Deterministic Policy Gradient (MADDPG).
+
+    Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017). Equation numbers in this file are those of
+    Zheng et al. (2023), https://proceedings.mlr.press/v222/zheng24a.html.
+
+    B worlds of N agents are a ``VecEnv`` of B * N slots, slot = world * N + agent, with an attribute ``n_agents``;
+    plain Gymnasium environments are worlds of one agent, for which MADDPG is DDPG. What SB3 counts in steps
+    (``total_timesteps``, ``learning_starts``, ``buffer_size``) are steps of agents; ``train_freq`` counts steps of
+    the ``VecEnv``, ``gradient_steps`` joint updates (-1: one per step of a world), ``log_interval`` episodes of
+    worlds.
+
+    :param policy: the policy to use (MlpPolicy, CnnPolicy)
+    :param env: the environment to learn from
+    :param learning_rate: learning rate of all networks, a number or a function of the progress remaining (1 to 0)
+    :param buffer_size: agent steps to keep
+    :param learning_starts: agent steps with uniformly random actions before learning starts
+    :param batch_size: joint transitions per update
+    :param tau: share by which the targets follow per update (Polyak)
+    :param gamma: discount factor
+    :param train_freq: steps of the ``VecEnv`` between trainings, or ``(n, "step" | "episode")``
+    :param gradient_steps: joint updates per training, -1: as many as steps of a world were made
+    :param action_noise: SB3's action noise, in place of ``exploration_noise`` unless both are given
+    :param n_agents: number of agents N, where the environment does not tell it by an attribute ``n_agents``
+    :param critic: ``"per_agent"``: a critic per agent (Lowe et al.); ``"shared"``: one trunk with a head per agent
+    :param exploration_noise: standard deviation of the Gaussian noise on scaled actions [-1, 1], a number or a
+        function of the progress remaining; by default 0.1, or none where ``action_noise`` is given
+    :param exploration_random: share of actions that are replaced by uniformly random ones, a number or a function
+        of the progress remaining
+    :param policy_delay: critic updates per update of the actors and the targets
+    :param max_grad_norm: largest norm of the gradient of the actors and of the critics, None: no limit
+    :param actor_regularization: weight of the actors' mean squared output before tanh (openai/maddpg: 1e-3)
+    :param policy_kwargs: passed on to the policy, see ``MADDPGPolicy``
+    :param seed: seed of the pseudo random generators
+    :param kwargs: passed on to SB3's ``OffPolicyAlgorithm``
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
+    n_critics: ClassVar[int] = 1
+    policy: MADDPGPolicy
+    actor: Actor
+    actor_target: Actor
+    critic: CentralCritic
+    critic_target: CentralCritic
+    replay_buffer: JointReplayBuffer | None
+    exploration_rng: np.random.Generator
+
+    def __init__(
+        self,
+        policy: str | type[MADDPGPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 1024,
+        batch_size: int = 1024,
+        tau: float = 0.01,
+        gamma: float = 0.95,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        *,
+        n_agents: int | None = None,
+        critic: CriticKind = "per_agent",
+        exploration_noise: float | Schedule | None = None,
+        exploration_random: float | Schedule = 0.0,
+        policy_delay: int = 1,
+        max_grad_norm: float | None = None,
+        actor_regularization: float = 1e-3,
+        policy_kwargs: dict[str, Any] | None = None,
+        seed: int | None = None,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            policy_kwargs=policy_kwargs,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+            **kwargs,
+        )
+        self.n_agents = n_agents
+        self.critic_kind = critic
+        if exploration_noise is None:
+            exploration_noise = 0.1 if action_noise is None else 0.0
+        self.exploration_noise = exploration_noise
+        self.exploration_random = exploration_random
+        self.policy_delay = policy_delay
+        self.max_grad_norm = max_grad_norm
+        self.actor_regularization = actor_regularization
+        self.exploration_rng = np.random.default_rng(seed)
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self._convert_train_freq()
+        if not isinstance(self.observation_space, spaces.Box):
+            raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
+        if self.n_steps != 1:
+            raise ValueError(f"MADDPG has one-step returns only, but got n_steps={self.n_steps}")
+        self.n_agents = count_agents(self.env, self.n_agents)
+        # The exploration's own generator goes on where a loaded model stopped
+        super().set_random_seed(self.seed)
+
+        self.replay_buffer_class = self.replay_buffer_class or JointReplayBuffer
+        if not issubclass(self.replay_buffer_class, JointReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class must be a JointReplayBuffer, but got {self.replay_buffer_class.__name__}"
+            )
+        if self.replay_buffer is None:
+            self.replay_buffer = self.replay_buffer_class(
+                self.buffer_size,
+                self.observation_space,
+                self.action_space,
+                device=self.device,
+                n_envs=self.n_envs,
+                n_agents=self.n_agents,
+                optimize_memory_usage=self.optimize_memory_usage,
+                **self.replay_buffer_kwargs,
+            )
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_agents=self.n_agents,
+            critic=self.critic_kind,
+            n_critics=self.n_critics,
+            **self.policy_kwargs,
+        )
+        self.policy = self.policy.to(self.device)
+        self._create_aliases()
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed all generators, the exploration's own included.
+
+        :param seed: None: nothing is changed
+        """
+        super().set_random_seed(seed)
+        if seed is not None:
+            self.exploration_rng = np.random.default_rng(seed)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Set the environment to learn from; it must have as many slots and agents as before.
+
+        :param env: the environment
+        :param force_reset: whether it is reset before training
+        :raises ValueError: where the number of agents differs
+        """
+        count_agents(env, self.n_agents)
+        super().set_env(env, force_reset)
+
+    def train(self, gradient_steps: int, batch_size: int = 1024) -> None:
+        """Update critics, actors and targets from the replay buffer.
+
+        :param gradient_steps: number of joint updates
+        :param batch_size: joint transitions per update
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        assert self.replay_buffer is not None
+
+        actor_losses: list[th.Tensor] = []
+        critic_losses: list[th.Tensor] = []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            # A minibatch of joint transitions (s, a_1 .. a_n, r_1 .. r_n, s')
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+            # The targets y_i = r_i + gamma Q'_i(s', mu'_1(o'_1) .. mu'_n(o'_n)) of Eq. 3; termination cuts the future
+            with th.no_grad():
+                next_q_values, _ = self.critic_target(batch.next_observations, self._target_actions(batch)).min(dim=0)
+                target_q_values = batch.rewards.T + (1 - batch.dones.T) * self.gamma * next_q_values
+
+            # Critics: minimise the mean of (y_i - Q_i(s, a_1 .. a_n))^2, Eq. 3
+            q_values = self.critic(batch.observations, batch.actions)
+            critic_loss = (q_values - target_q_values).square().mean(-1).sum()
+            self._optimize(self.critic, critic_loss)
+            critic_losses.append(critic_loss.detach())
+
+            if self._n_updates % self.policy_delay == 0:
+                # Actors: ascend the mean of Q_i(s, a_1 .. mu_i(o_i) .. a_n), Eq. 2
+                logits = self.actor.logits(batch.observations)
+                q_values = self.critic.own_action_values(batch.observations, batch.actions, th.tanh(logits))
+                actor_loss = -q_values.mean(-1).sum()
+                penalty = self.actor_regularization * logits.square().mean((0, 2)).sum()
+                self._optimize(self.actor, actor_loss + penalty)
+                actor_losses.append(actor_loss.detach())
+
+                # Targets follow slowly
+                polyak_update(self.critic, self.critic_target, self.tau)
+                polyak_update(self.actor, self.actor_target, self.tau)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if actor_losses:
+            self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
+        self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
+
+    def _target_actions(self, batch: ReplayBufferSamples) -> th.Tensor:
+        """Return the target actors' actions mu'_k(o'_k) in [-1, 1], shape (B, N, U)."""
+        actions: th.Tensor = self.actor_target(batch.next_observations)
+        return actions
+
+    def _optimize(self, network: Actor | CentralCritic, loss: th.Tensor) -> None:
+        """One gradient step on the parameters of ``network`` alone."""
+        parameters = list(network.parameters())
+        network.optimizer.zero_grad()
+        loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+        if self.max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        network.optimizer.step()
+
+    def learn(
+        self: SelfMADDPG,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "MADDPG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfMADDPG:
+        """Return the trained model.
+
+        :param total_timesteps: agent steps to train on, a lower bound
+        :param callback: called at every step of the ``VecEnv``
+        :param log_interval: episodes of worlds between logs; at most one log a step
+        :param tb_log_name: name of the run for TensorBoard
+        :param reset_num_timesteps: whether to count from 0 again
+        :param progress_bar: whether to show one
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """Step the environment and store what happens, as SB3 does, but count worlds and touch only slots that end.
+
+        :param env: the training environment
+        :param callback: called at every step
+        :param train_freq: how much to collect
+        :param replay_buffer: where to store it
+        :param action_noise: SB3's action noise
+        :param learning_starts: agent steps with uniformly random actions
+        :param log_interval: episodes of worlds between logs
+        :return: steps and episodes of worlds, and whether to go on
+        """
+        assert self.n_agents is not None
+        n_worlds = env.num_envs // self.n_agents
+        if train_freq.unit == TrainFrequencyUnit.EPISODE and n_worlds > 1:
+            raise ValueError(f"train_freq in episodes needs one world, but there are {n_worlds}")
+        self.policy.set_training_mode(False)
+        num_collected_steps, num_collected_episodes = 0, 0
+        callback.on_rollout_start()
+        while should_collect_more_steps(train_freq, num_collected_steps, num_collected_episodes):
+            actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
+            new_obs, rewards, dones, infos = env.step(actions)
+            self.num_timesteps += env.num_envs
+            num_collected_steps += 1
+
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return RolloutReturn(num_collected_steps * n_worlds, num_collected_episodes, continue_training=False)
+
+            self._update_info_buffer(infos, dones)
+            self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._on_step()
+
+            if dones.any():
+                if action_noise is not None:
+                    action_noise.reset(**({"indices": np.flatnonzero(dones)} if env.num_envs > 1 else {}))
+                ended = int(dones.reshape(n_worlds, self.n_agents).all(axis=1).sum())
+                num_collected_episodes += ended
+                self._episode_num += ended
+                if log_interval is not None and self._episode_num % log_interval < ended:
+                    self.dump_logs()
+        callback.on_rollout_end()
+        return RolloutReturn(num_collected_steps * n_worlds, num_collected_episodes, continue_training=True)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions with exploration, in one draw for all slots.
+
+        :param learning_starts: agent steps with uniformly random actions
+        :param action_noise: SB3's action noise
+        :param n_envs: number of slots
+        :return: actions for the environment, and the same scaled to [-1, 1] for the buffer, shapes (B * N, *U)
+        """
+        rng, shape = self.exploration_rng, (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        if self.num_timesteps < learning_starts:
+            scaled = rng.uniform(-1, 1, shape)
+        else:
+            assert self._last_obs is not None
+            actions, _ = self.predict(self._last_obs)
+            scaled = self.policy.scale_action(actions)
+            std = FloatSchedule(self.exploration_noise)(self._current_progress_remaining)
+            if std > 0:
+                scaled = scaled + std * rng.standard_normal(shape)
+            share = FloatSchedule(self.exploration_random)(self._current_progress_remaining)
+            if share > 0:
+                replaced = rng.random(n_envs) < share
+                scaled[replaced] = rng.uniform(-1, 1, (np.count_nonzero(replaced), *shape[1:]))
+        if action_noise is not None:
+            scaled = scaled + action_noise()
+        scaled = np.clip(scaled, -1, 1).astype(np.float32)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray,  # type: ignore[override]
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of all slots: unnormalised, and with the last observation of the episodes that ended.
+
+        :param replay_buffer: where to store it
+        :param buffer_action: scaled actions, shape (B * N, *U)
+        :param new_obs: observations after the step, after the reset where ``dones``, shape (B * N, *O)
+        :param reward: rewards, shape (B * N,)
+        :param dones: whether the episode ended, shape (B * N,)
+        :param infos: ``terminal_observation`` is the last observation of an episode that ended
+        """
+        obs, next_obs = self._last_obs, new_obs
+        if self._vec_normalize_env is not None:
+            obs = self._last_original_obs
+            next_obs = self._last_original_obs = self._vec_normalize_env.get_original_obs()  # type: ignore[assignment]
+            reward = self._vec_normalize_env.get_original_reward()
+        self._last_obs = new_obs
+
+        ended = np.flatnonzero(dones)
+        if len(ended):
+            next_obs = next_obs.copy()
+        for slot in ended:
+            terminal_obs = infos[slot].get("terminal_observation")
+            if terminal_obs is not None:
+                if self._vec_normalize_env is not None:
+                    terminal_obs = self._vec_normalize_env.unnormalize_obs(terminal_obs)
+                next_obs[slot] = terminal_obs
+        assert isinstance(obs, np.ndarray)
+        replay_buffer.add(obs, next_obs, buffer_action, reward, dones, infos)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        """Note the return, length and success of the worlds' episodes that ended: means over the world's agents.
+
+        :param infos: ``episode`` of ``Monitor`` and ``is_success`` are read where ``dones``
+        :param dones: whether the episode ended, shape (B * N,)
+        """
+        assert self.n_agents is not None
+        assert self.ep_info_buffer is not None
+        assert self.ep_success_buffer is not None
+        if dones is None:
+            return
+        for world in np.flatnonzero(dones.reshape(-1, self.n_agents).all(axis=1)):
+            world_infos = infos[world * self.n_agents : (world + 1) * self.n_agents]
+            episodes = [info["episode"] for info in world_infos if "episode" in info]
+            successes = [info["is_success"] for info in world_infos if "is_success" in info]
+            if episodes:
+                self.ep_info_buffer.append({key: np.mean([episode[key] for episode in episodes]) for key in "rlt"})
+            if successes:
+                self.ep_success_buffer.append(np.mean(successes))
+
+    @classmethod
+    def load(
+        cls: type[SelfMADDPG],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfMADDPG:
+        """Load a model from a zip-file of ``save``, for any number of worlds.
+
+        **Such a file can run code when it is loaded: load only files that you trust.** An ``UntrustedFileWarning``
+        says so every time; filter it where you know where your files come from.
+
+        :param path: the file
+        :param env: the environment to go on with; it must have the number of agents that was saved
+        :param device: where to put the networks
+        :param custom_objects: objects to use in place of saved ones
+        :param print_system_info: whether to print the versions saved and in use
+        :param force_reset: whether ``env`` is reset before training
+        :param kwargs: attributes to change
+        :raises ValueError: where the number of agents differs
+        """
+        warnings.warn(
+            f"{path} is a zip-file of pickled objects, which can run code when it is loaded: load only what you trust.",
+            UntrustedFileWarning,
+            stacklevel=2,
+        )
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
+    """Return the number of agents in each world of ``env``.
+
+    :param env: an environment tells it by an attribute ``n_agents``; a Gymnasium environment, alone or in SB3's
+        ``DummyVecEnv`` and ``SubprocVecEnv``, has one; of others it is not known. None: a model without one
+    :param n_agents: what the user or a saved model says
+    :raises ValueError: where it is not known, differs from ``n_agents`` or does not divide the number of slots
+    """
+    told = None
+    if isinstance(env, VecEnv):
+        told = getattr(env, "n_agents", None)
+        inner: Any = env
+        while isinstance(inner, VecEnvWrapper):
+            inner = inner.venv
+        if told is None and (isinstance(inner, DummyVecEnv | SubprocVecEnv) or env.num_envs == 1):
+            told = 1
+    elif env is not None:
+        told = 1
+    if told is not None and n_agents is not None and told != n_agents:
+        raise ValueError(f"the environment has n_agents={told}, but n_agents={n_agents} was given or saved")
+    n = n_agents if told is None else int(told)
+    if n is None:
+        raise ValueError(
+            "the environment has several slots but does not tell how many of them are the agents of one world: "
+            "build it with make_vec_env, or give n_agents=..."
+        )
+    if isinstance(env, VecEnv) and (n < 1 or env.num_envs % n):
+        raise ValueError(f"{env.num_envs} slots are no whole number of worlds with n_agents={n}")
+    return n
+
+
+@th.no_grad()
+def polyak_update(network: nn.Module, target: nn.Module, tau: float) -> None:
+    """Move the target's parameters by the share ``tau`` towards the network's, and copy its buffers."""
+    th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+    copies: Sequence[tuple[th.Tensor, th.Tensor]] = list(zip(target.buffers(), network.buffers(), strict=True))
+    for target_buffer, buffer in copies:
+        target_buffer.copy_(buffer)

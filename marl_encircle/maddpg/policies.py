@@ -1,0 +1,372 @@
+"""Decentralised actors, centralised critics and the policy that holds them.
+
+Shape legend: B minibatch, N agents, O observation size, U action size.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    FlattenExtractor,
+    NatureCNN,
+    get_actor_critic_arch,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from marl_encircle.maddpg.networks import AgentFeatures, QNetwork, StackedMLP
+
+CriticKind = Literal["per_agent", "shared"]
+
+
+class AgentModel(BaseModel):
+    """What actor and critic have in common: features of every agent's observation, in the model's own precision."""
+
+    features_extractor: BaseFeaturesExtractor
+
+    def agent_features(self, obs: th.Tensor) -> th.Tensor:
+        """Features of the joint observation.
+
+        :param obs: observations, shape (B, N, *O)
+        :return: shape (B, N, features)
+        """
+        inputs = preprocess_obs(obs, self.observation_space, normalize_images=self.normalize_images)
+        assert isinstance(inputs, th.Tensor)
+        features: th.Tensor = self.features_extractor(inputs.to(next(self.parameters()).dtype))
+        return features
+
+
+class Actor(AgentModel, BasePolicy):
+    """The N deterministic actors mu_i: each maps its agent's own observation to its action.
+
+    :param observation_space: one agent's observation space
+    :param action_space: one agent's action space
+    :param n_agents: number of agents N
+    :param net_arch: sizes of the hidden layers
+    :param features_extractor: applied to each agent's observation
+    :param features_dim: number of features of one observation
+    :param activation_fn: activation after every hidden layer
+    :param normalize_images: whether to divide images by 255
+    :param share_parameters: one network for all agents
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        n_agents: int,
+        net_arch: list[int],
+        features_extractor: AgentFeatures,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        share_parameters: bool = False,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.n_agents = n_agents
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.share_parameters = share_parameters
+        layer_dims = [*net_arch, get_action_dim(action_space)]
+        self.mu = StackedMLP(1 if share_parameters else n_agents, features_dim, layer_dims, activation_fn)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "n_agents": self.n_agents,
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "share_parameters": self.share_parameters,
+        }
+
+    def logits(self, obs: th.Tensor) -> th.Tensor:
+        """Actions before squashing, shape (B, N, U).
+
+        :param obs: observations, shape (B, N, *O)
+        """
+        logits: th.Tensor = self.mu(self.agent_features(obs).transpose(0, 1))
+        return logits.transpose(0, 1)
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """Actions in [-1, 1], shape (B, N, U).
+
+        :param obs: observations, shape (B, N, *O)
+        """
+        return th.tanh(self.logits(obs))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Actions of the slots, shape (B * N, U): always deterministic.
+
+        :param observation: observations of the slots, world-major, shape (B * N, *O)
+        """
+        assert isinstance(observation, th.Tensor)
+        if len(observation) % self.n_agents:
+            raise ValueError(
+                f"predict needs the observations of all {self.n_agents} agents, shape (n_worlds * {self.n_agents}, "
+                f"{', '.join(map(str, observation.shape[1:]))}), but got {len(observation)} row(s)"
+            )
+        actions: th.Tensor = self(observation.view(-1, self.n_agents, *observation.shape[1:]))
+        return actions.flatten(0, 1)
+
+
+class CentralCritic(AgentModel):
+    """The action values Q_i(s, a_1 ... a_N) of every agent; s is all agents' observations.
+
+    :param observation_space: one agent's observation space
+    :param action_space: one agent's action space
+    :param n_agents: number of agents N
+    :param net_arch: sizes of the hidden layers
+    :param features_extractor: applied to each agent's observation
+    :param features_dim: number of features of one observation
+    :param activation_fn: activation after every hidden layer
+    :param normalize_images: whether to divide images by 255
+    :param kind: ``"per_agent"``: a network per agent; ``"shared"``: one trunk with a head per agent
+    :param n_critics: independent estimates of each Q_i
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        n_agents: int,
+        net_arch: list[int],
+        features_extractor: AgentFeatures,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        kind: CriticKind = "per_agent",
+        n_critics: int = 1,
+    ) -> None:
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        input_dim = n_agents * (features_dim + get_action_dim(action_space))
+        self.q_networks = nn.ModuleList(
+            QNetwork(n_agents, input_dim, net_arch, activation_fn, shared=kind == "shared") for _ in range(n_critics)
+        )
+        self.own_agent: th.Tensor  # (N, 1, N, 1): row i is true at agent i
+        self.register_buffer("own_agent", th.eye(n_agents, dtype=th.bool)[:, None, :, None], persistent=False)
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Estimates of Q_i(s, a_1 ... a_N) of every agent i, shape (n_critics, N, B).
+
+        :param obs: observations, shape (B, N, *O)
+        :param actions: actions in [-1, 1], shape (B, N, U)
+        """
+        x = th.cat([self.agent_features(obs).flatten(1), actions.flatten(1)], dim=-1)
+        return th.stack([q_network(x[None]) for q_network in self.q_networks])
+
+    def own_action_values(self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor) -> th.Tensor:
+        """First estimate of Q_i(s, a_1 .. a_i = mu_i(o_i) .. a_N) of every agent i, shape (N, B).
+
+        :param obs: observations, shape (B, N, *O)
+        :param actions: actions in [-1, 1] that the other agents keep, shape (B, N, U)
+        :param own_actions: the action that agent i takes where Q_i is asked, shape (B, N, U)
+        """
+        features = self.agent_features(obs).flatten(1).expand(len(self.own_agent), -1, -1)
+        x = th.cat([features, th.where(self.own_agent, own_actions, actions).flatten(2)], dim=-1)
+        q_values: th.Tensor = self.q_networks[0](x)
+        return q_values
+
+
+class MADDPGPolicy(BasePolicy):
+    """Actors, critics and their targets.
+
+    :param observation_space: one agent's observation space
+    :param action_space: one agent's action space
+    :param lr_schedule: learning rate schedule
+    :param n_agents: number of agents N
+    :param critic: ``"per_agent"``: a critic per agent; ``"shared"``: one trunk with a head per agent
+    :param n_critics: independent estimates of each Q_i
+    :param net_arch: sizes of the hidden layers, one list for all networks or ``dict(pi=[...], qf=[...])``
+    :param activation_fn: activation after every hidden layer
+    :param features_extractor_class: applied to each agent's observation
+    :param features_extractor_kwargs: its keyword arguments
+    :param normalize_images: whether to divide images by 255
+    :param optimizer_class: one optimizer for all actors, one for all critics
+    :param optimizer_kwargs: its keyword arguments, except the learning rate; Adam is fused unless told otherwise
+    :param share_parameters: one actor for all agents; the critics stay as ``critic`` says
+    """
+
+    actor: Actor
+    actor_target: Actor
+    critic: CentralCritic
+    critic_target: CentralCritic
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        n_agents: int = 1,
+        critic: CriticKind = "per_agent",
+        n_critics: int = 1,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        share_parameters: bool = False,
+    ) -> None:
+        if optimizer_kwargs is None:
+            optimizer_kwargs = {"fused": True} if optimizer_class is th.optim.Adam else {}
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        if critic not in ("per_agent", "shared"):
+            raise ValueError(f'critic is "per_agent" or "shared", not {critic!r}')
+        self.n_agents = n_agents
+        self.critic_kind = critic
+        self.n_critics = n_critics
+        # Two hidden layers of 64 as in openai/maddpg
+        self.net_arch = [64, 64] if net_arch is None else net_arch
+        self.activation_fn = activation_fn
+        self.share_parameters = share_parameters
+        self._build(lr_schedule)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.actor, self.actor_target = self.make_actor(), self.make_actor()
+        self.critic, self.critic_target = self.make_critic(), self.make_critic()
+        for network, target in (self.actor, self.actor_target), (self.critic, self.critic_target):
+            target.load_state_dict(network.state_dict())
+            target.set_training_mode(False)
+            target.requires_grad_(False)
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
+
+    def make_features_extractor(self) -> AgentFeatures:
+        """SB3's extractor for one observation, copied for every agent if it learns."""
+        first = super().make_features_extractor()
+        learns = any(True for _ in first.parameters())
+        n_more = self.n_agents - 1 if learns and not self.share_parameters else 0
+        more = [super(MADDPGPolicy, self).make_features_extractor() for _ in range(n_more)]
+        return AgentFeatures(self.observation_space, [first, *more], self.n_agents)
+
+    def _net_args(self) -> dict[str, Any]:
+        return self._update_features_extractor(
+            {
+                "observation_space": self.observation_space,
+                "action_space": self.action_space,
+                "n_agents": self.n_agents,
+                "activation_fn": self.activation_fn,
+                "normalize_images": self.normalize_images,
+            }
+        )
+
+    def make_actor(self) -> Actor:
+        """Return new actors."""
+        net_arch, _ = get_actor_critic_arch(self.net_arch)
+        return Actor(**self._net_args(), net_arch=net_arch, share_parameters=self.share_parameters).to(self.device)
+
+    def make_critic(self) -> CentralCritic:
+        """Return new critics."""
+        _, net_arch = get_actor_critic_arch(self.net_arch)
+        return CentralCritic(**self._net_args(), net_arch=net_arch, kind=self.critic_kind, n_critics=self.n_critics).to(
+            self.device
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "lr_schedule": self._dummy_schedule,  # not needed to load a policy alone
+            "n_agents": self.n_agents,
+            "critic": self.critic_kind,
+            "n_critics": self.n_critics,
+            "net_arch": self.net_arch,
+            "activation_fn": self.activation_fn,
+            "features_extractor_class": self.features_extractor_class,
+            "features_extractor_kwargs": self.features_extractor_kwargs,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+            "share_parameters": self.share_parameters,
+        }
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Actions of the slots in [-1, 1], shape (B * N, U)."""
+        return self._predict(observation, deterministic=deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor._predict(observation, deterministic=deterministic)
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | Mapping[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray | dict[str, np.ndarray], tuple[np.ndarray, ...] | None]:
+        """Actions for the agents of one or more worlds.
+
+        :param observation: world-major slots, shape (B * N, *O), one world, (N, *O), or a dict of the agents'
+            observations, each (*O), in the order of the environment's ``possible_agents``
+        :param state: unused, SB3's interface
+        :param episode_start: unused, SB3's interface
+        :param deterministic: unused: the actors are deterministic
+        :return: actions in the form of the observation, and ``state``
+        :raises ValueError: where observations of some agents are missing
+        """
+        if not isinstance(observation, Mapping):
+            return super().predict(observation, state, episode_start, deterministic)
+        if len(observation) != self.n_agents:
+            raise ValueError(
+                f"predict needs the observations of all {self.n_agents} agents, but got {list(observation)}"
+            )
+        actions, state = super().predict(np.stack(list(observation.values())), state, episode_start, deterministic)
+        return dict(zip(observation, actions, strict=True)), state
+
+    def actor_state_dict(self) -> dict[str, th.Tensor]:
+        """All that is needed to act: the actors' weights as plain named tensors on the CPU."""
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in self.actor.state_dict().items()}
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Put actors and critics in training or evaluation mode; the targets are always in evaluation mode.
+
+        :param mode: whether to train
+        """
+        self.actor.set_training_mode(mode)
+        self.critic.set_training_mode(mode)
+        self.training = mode
+
+
+MlpPolicy = MADDPGPolicy
+
+
+class CnnPolicy(MADDPGPolicy):
+    """MADDPGPolicy for images: SB3's ``NatureCNN`` extracts the features unless told otherwise."""
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
