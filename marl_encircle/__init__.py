@@ -1,0 +1,1 @@
+"""Encircling a faster target with multi-agent reinforcement learning."""
