@@ -1,0 +1,259 @@
+"""The simulator: B worlds side by side, each with its own stream of random numbers and its own difficulty."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_encircle.core import dynamics, geometry, scenes
+from marl_encircle.core.geometry import Enclosure, Measure
+from marl_encircle.core.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+PLACEMENT_DRAWS = 32
+"""Placements that are tried per world; each may use twice the random numbers of the one before."""
+
+MAX_UNIFORMS = 1 << 14
+"""Most random numbers that one try may use."""
+
+
+class PlacementError(RuntimeError):
+    """The bodies of a scene did not fit in the bounded number of tries."""
+
+
+class State(NamedTuple):
+    """Where everything is. Live arrays of the simulator, changed in place by ``step`` and ``reset``."""
+
+    pursuers: Array
+    """Positions [scene units], (B, N, 2)."""
+    velocities: Array
+    """Pursuers' velocities [scene units per time unit], (B, N, 2)."""
+    target: Array
+    """Position [scene units], (B, 2)."""
+    discs: Array
+    """x, y, radius of the discs that obstacles consist of [scene units], (B, D, 3)."""
+    obstacles: Array
+    """Centres of the obstacles [scene units], (B, M, 2)."""
+    speed_ratio: Array
+    """lambda of each world's present round, (B,)."""
+    safety_distance: Array
+    """d_safe of each world's present round [scene units], (B,)."""
+    obstacle_radius: Array
+    """R of each world's present round [scene units], (B,)."""
+
+
+class Difficulty(TypedDict, total=False):
+    """What a curriculum may change from round to round; the fields of ``Scenario`` with these names."""
+
+    speed_ratio: float
+    safety_distance: float
+    obstacle_radius: float
+
+
+def world_seeds(seed: int, n: int) -> list[int]:
+    """Return the seeds of n worlds, the same for the first worlds whatever n is: 63-bit integers."""
+    words = np.random.SeedSequence(seed).generate_state(n, np.uint64) >> np.uint64(1)
+    return [int(word) for word in words]
+
+
+class Simulator:
+    """B worlds of one scenario.
+
+    :param scenario: the rules; worlds may differ in difficulty only
+    :param n_worlds: B
+    :param seed: see :meth:`seed`; without one, worlds start from fresh entropy
+    """
+
+    def __init__(self, scenario: Scenario, n_worlds: int = 1, seed: int | None = None) -> None:
+        if n_worlds < 1:
+            raise ValueError(f"n_worlds must be at least 1; got {n_worlds}")
+        self.scenario = scenario
+        self.n_worlds = n_worlds
+        self.steps = np.zeros(n_worlds, np.int64)
+        self._physics = dynamics.physics_of(scenario)
+        self._move_target = _target(scenario.target)
+        self._rays = geometry.half_circle(scenario.n_directions)
+        self._shape = scenes.SCENES[scenario.scene]()
+        self._everywhere = np.arange(n_worlds)
+        self._actions_shape = (n_worlds, scenario.pursuers, 2)
+        self._difficulty: Difficulty = {}
+        self.state = self._empty_state()
+        self._present, self._former = _MeasureBuffers(scenario, n_worlds), _MeasureBuffers(scenario, n_worlds)
+        self._streams: list[np.random.Generator] = []
+        self.seed(seed)
+
+    @property
+    def measure(self) -> Measure:
+        """The measure of the present state."""
+        return self._present.measure
+
+    @property
+    def former_measure(self) -> Measure:
+        """The measure before the last step."""
+        return self._former.measure
+
+    def seed(self, seed: int | Sequence[int] | None = None) -> None:
+        """Give every world a new random stream, which its next resets draw from.
+
+        :param seed: one seed for all (world b gets ``world_seeds(seed, B)[b]``), or one for each world
+        """
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
+        seeds = world_seeds(seed, self.n_worlds) if isinstance(seed, int) else list(seed)
+        if len(seeds) != self.n_worlds:
+            raise ValueError(f"{self.n_worlds} worlds need {self.n_worlds} seeds; got {len(seeds)}")
+        self._streams = [np.random.default_rng(s) for s in seeds]
+
+    def set_difficulty(self, difficulty: Difficulty) -> None:
+        """Change speed ratio, safety distance or obstacle radius from each world's next reset on."""
+        self._difficulty = {**self._difficulty, **difficulty}
+
+    def reset(self, worlds: NDArray[np.int64] | None = None) -> Measure:
+        """Start a new round in some worlds, all by default.
+
+        :param worlds: indices of the worlds to reset, (W,)
+        :raises PlacementError: if the bodies cannot be placed
+        """
+        worlds = self._everywhere if worlds is None else worlds
+        for name in ("speed_ratio", "safety_distance", "obstacle_radius"):
+            values: Array = getattr(self.state, name)
+            values[worlds] = self._difficulty.get(name, getattr(self.scenario, name))  # type: ignore[call-overload]
+        self._place(worlds)
+        self.state.velocities[worlds] = 0.0
+        self.steps[worlds] = 0
+        self._enclose(worlds)
+        return self.measure
+
+    def step(self, actions: ArrayLike) -> Measure:
+        """Move all worlds by one step.
+
+        :param actions: accelerations (velocities in first-order dynamics) as shares of the limit, in [-1, 1], (B, N, 2)
+        :return: the measure of the new state, valid until the step after the next
+        :raises ValueError: for actions of a wrong shape, or not finite, naming world and pursuer; nothing moves then
+        """
+        actions = self._checked(actions)
+        s = self.state
+        seen = s.pursuers.copy() if self.scenario.turn_order == "simultaneous" else s.pursuers
+        dynamics.move_pursuers(self._everywhere, actions, s.pursuers, s.velocities, s.target, s.discs, self._physics)
+        self._move_target(self._everywhere, seen, s.target, s.discs, s.speed_ratio, s.safety_distance, self._physics)
+        self._present, self._former = self._former, self._present
+        self._enclose(self._everywhere)
+        self.steps += 1
+        return self.measure
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the future depends on, as arrays and plain numbers."""
+        return {
+            "state": {name: array.copy() for name, array in self.state._asdict().items()},
+            "steps": self.steps.copy(),
+            "difficulty": dict(self._difficulty),
+            "streams": [stream.bit_generator.state for stream in self._streams],
+        }
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Go on from what :meth:`get_state` returned, bit for bit."""
+        for name, array in saved["state"].items():
+            getattr(self.state, name)[:] = array
+        self.steps[:] = saved["steps"]
+        self._difficulty = saved["difficulty"]
+        for stream, stream_state in zip(self._streams, saved["streams"], strict=True):
+            stream.bit_generator.state = stream_state
+        self._enclose(self._everywhere)
+
+    def _checked(self, actions: ArrayLike) -> Array:
+        array = np.ascontiguousarray(actions, dtype=np.float64)
+        if array.shape != self._actions_shape:
+            raise ValueError(f"actions must have shape {self._actions_shape} (worlds, pursuers, 2); got {array.shape}")
+        slot = dynamics.first_bad_action(array)
+        if slot >= 0:
+            world, pursuer = divmod(slot, self.scenario.pursuers)
+            raise ValueError(
+                f"the action of {self.scenario.agents[pursuer]} in world {world} is not finite: {array[world, pursuer]}"
+            )
+        return array
+
+    def _enclose(self, worlds: NDArray[np.int64]) -> None:
+        s = self.state
+        geometry.enclose(
+            worlds, s.pursuers, s.target, s.discs, s.speed_ratio, self._rays, self._physics, *self._present.arrays
+        )
+
+    def _empty_state(self) -> State:
+        b, n, d = self.n_worlds, self.scenario.pursuers, self.scenario.discs
+        return State(
+            pursuers=np.zeros((b, n, 2)),
+            velocities=np.zeros((b, n, 2)),
+            target=np.zeros((b, 2)),
+            discs=np.zeros((b, d, 3)),
+            obstacles=np.zeros((b, self.scenario.obstacles, 2)),
+            speed_ratio=np.ones(b),
+            safety_distance=np.zeros(b),
+            obstacle_radius=np.zeros(b),
+        )
+
+    def _place(self, worlds: NDArray[np.int64]) -> None:
+        scenario, s = self.scenario, self.state
+        uniforms_needed = 3 * scenario.obstacles + 2 * (scenario.pursuers + 1)
+        waiting = worlds
+        for attempt in range(PLACEMENT_DRAWS):
+            uniforms = np.empty((len(waiting), min(8 * uniforms_needed << attempt, MAX_UNIFORMS)))
+            for row, b in zip(uniforms, waiting, strict=True):
+                self._streams[b].random(out=row)
+            placed = scenes.place(
+                waiting,
+                uniforms,
+                self._shape,
+                s.obstacle_radius,
+                scenario.pursuer_radius,
+                scenario.target_radius,
+                scenario.half_width,
+                scenario.obstacle_limit,
+                scenario.placement == "separated",
+                s.pursuers,
+                s.target,
+                s.discs,
+                s.obstacles,
+            )
+            waiting = waiting[~placed]
+            if not len(waiting):
+                return
+        raise PlacementError(
+            f"{scenario.obstacles} obstacles of radius {s.obstacle_radius[waiting[0]]:g}, the target and "
+            f"{scenario.pursuers} pursuers could not be placed without overlap in {PLACEMENT_DRAWS} tries; "
+            "use fewer or smaller bodies, or placement='overlapping'"
+        )
+
+
+class _MeasureBuffers:
+    """The arrays that ``geometry.enclose`` fills in, and the measure that views them."""
+
+    def __init__(self, scenario: Scenario, n_worlds: int) -> None:
+        b, n, k = n_worlds, scenario.pursuers, scenario.n_directions
+        owner = np.full((2, b, k), geometry.NOBODY, np.int8)
+        nearness = np.zeros((2, b, k))
+        contributing_angle = np.zeros((2, b, n + scenario.units))
+        occupied_angle = np.zeros((2, b))
+        movement_range = np.full((2, b), np.inf)
+        complete = np.zeros((2, b), np.bool_)
+        target_distance = np.zeros((b, n))
+        contacts = np.zeros((3, b, n), np.int64)
+        by_rule = (owner, nearness, contributing_angle, occupied_angle, movement_range, complete)
+        self.arrays = (*by_rule, target_distance, contacts)
+        self.measure = Measure(
+            enclosure={
+                "all": Enclosure(*(a[0] for a in by_rule)),
+                "pursuers": Enclosure(*(a[1] for a in by_rule)),
+            },
+            target_distance=target_distance,
+            contacts_pursuers=contacts[0],
+            contacts_target=contacts[1],
+            contacts_obstacles=contacts[2],
+        )
+
+
+def _target(name: str) -> Any:
+    if name not in dynamics.TARGETS:
+        raise ValueError(f"target must be one of {', '.join(dynamics.TARGETS)}; got {name!r}")
+    return dynamics.TARGETS[name]
