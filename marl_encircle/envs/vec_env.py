@@ -1,0 +1,176 @@
+"""The native road: thousands of worlds as one Stable-Baselines3 VecEnv."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+
+from marl_encircle.core.observations import bounds, observe
+from marl_encircle.core.rewards import Reward, Transition
+from marl_encircle.core.rounds import Rounds
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.simulator import Difficulty, Simulator, world_seeds
+
+
+class EncirclementVecEnv(VecEnv):
+    """B worlds of N pursuers as B * N environment slots, world by world: slot = world * N + pursuer.
+
+    Every slot has its own scalar reward. All slots of a world end together: terminated when the encirclement is
+    complete under the reward's closure rule, truncated (``TimeLimit.truncated``) after ``scenario.max_cycles`` steps.
+
+    At the last step of a round the info of each of its slots holds ``is_success``, ``terminal_observation``,
+    ``TimeLimit.truncated`` and ``round``, the round's figures; at other steps it is empty.
+
+    :param scenario: the rules
+    :param reward: the reward, and the closure rule that ends a round
+    :param n_worlds: B
+    :param seed: see :meth:`seed`
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario | None = None,
+        reward: Reward | None = None,
+        n_worlds: int = 1,
+        seed: int | None = None,
+    ) -> None:
+        self.scenario = scenario or Scenario()
+        self.terms = reward or Reward()
+        self.n_worlds, self.n_agents = n_worlds, self.scenario.pursuers
+        self.agents = list(self.scenario.agents)
+        self.render_mode = None
+        self.simulator = Simulator(self.scenario, n_worlds)
+        self.rounds = Rounds(self.scenario, self.terms.closure, n_worlds)
+        self._actions = np.zeros((n_worlds, self.n_agents, 2))
+        low, high = bounds(self.scenario)
+        super().__init__(
+            num_envs=n_worlds * self.n_agents,
+            observation_space=spaces.Box(low, high),
+            action_space=spaces.Box(-1.0, 1.0, (2,)),
+        )
+        if seed is not None:
+            self.seed(seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Give every world its own random stream from the next ``reset`` on: ``world_seeds(seed, B)[b]`` for world b.
+
+        :return: the seed of each slot's world
+        """
+        entropy = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        self._seeds = [s for s in world_seeds(entropy, self.n_worlds) for _ in range(self.n_agents)]
+        return self._seeds
+
+    def set_difficulty(self, difficulty: Difficulty) -> None:
+        """Change speed ratio, safety distance or obstacle radius from each world's next round on."""
+        self.simulator.set_difficulty(difficulty)
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start a new round in every world.
+
+        :return: observations, (B * N, O)
+        """
+        if self._seeds[0] is not None:
+            self.simulator.seed([int(s) for s in self._seeds[:: self.n_agents] if s is not None])
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.simulator.reset()
+        self.rounds.start(np.arange(self.n_worlds))
+        return self._slots(self._observe())
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for ``step_wait``.
+
+        :param actions: one row a slot, in [-1, 1], (B * N, 2)
+        :raises ValueError: for a wrong shape
+        """
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs, 2):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 2), one row a slot; got {actions.shape}")
+        self._actions = actions.reshape(self.n_worlds, self.n_agents, 2)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Move all worlds by one step; worlds whose round ended start the next one.
+
+        :return: observations (B * N, O), rewards (B * N,), dones (B * N,), infos
+        :raises ValueError: for an action that is not finite, naming world and pursuer
+        """
+        sim = self.simulator
+        measure = sim.step(self._actions)
+        transition = Transition(
+            self.scenario, sim.state, self._actions, measure, sim.former_measure, self.terms.closure
+        )
+        shares = self.terms.parts(transition)
+        self.rounds.add(sim.steps, measure, shares)
+        rewards = sum(shares.values(), np.zeros((self.n_worlds, self.n_agents)))
+        terminated = transition.enclosure.complete
+        done = terminated | (sim.steps >= self.scenario.max_cycles)
+        observations = self._observe()
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        worlds = np.flatnonzero(done)
+        if len(worlds):
+            for b in worlds.tolist():
+                figures = self.rounds.summary(b)
+                for i in range(self.n_agents):
+                    infos[b * self.n_agents + i] = {
+                        "is_success": bool(terminated[b]),
+                        "TimeLimit.truncated": not terminated[b],
+                        "terminal_observation": observations[b, i].copy(),
+                        "round": figures,
+                    }
+            sim.reset(worlds)
+            self.rounds.start(worlds)
+            observe(sim, observations, worlds)
+        return (
+            self._slots(observations),
+            rewards.astype(np.float32).ravel(),
+            np.repeat(done, self.n_agents),
+            infos,
+        )
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to give back."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of this VecEnv once for each slot asked for."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of this VecEnv; all slots share it."""
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of this VecEnv, once, and return its result for each slot asked for."""
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
+        """Return False for each slot: worlds are no Gymnasium environments that could be wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the next steps depend on, for an exact resume."""
+        return {"simulator": self.simulator.get_state(), "rounds": self.rounds.get_state()}
+
+    def set_state(self, saved: dict[str, Any]) -> NDArray[np.float32]:
+        """Go on from what :meth:`get_state` returned.
+
+        :return: the present observations, (B * N, O)
+        """
+        self.simulator.set_state(saved["simulator"])
+        self.rounds.set_state(saved["rounds"])
+        return self._slots(self._observe())
+
+    def _observe(self) -> NDArray[np.float32]:
+        size = self.observation_space.shape or (0,)
+        observations = np.empty((self.n_worlds, self.n_agents, *size), np.float32)
+        observe(self.simulator, observations)
+        return observations
+
+    def _slots(self, per_world: NDArray[np.float32]) -> NDArray[np.float32]:
+        return per_world.reshape(self.num_envs, -1)
