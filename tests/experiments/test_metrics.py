@@ -3,28 +3,20 @@ import math
 
 import numpy as np
 import pytest
+from made_up import episode, rounds
 from numpy.typing import NDArray
 from scipy import stats
 
 from marl_encircle.experiments import metrics
-from marl_encircle.experiments.metrics import Episode, Interval
+from marl_encircle.experiments.metrics import Interval
+from marl_encircle.experiments.records import Episode
 
 Shares = NDArray[np.float64]
-
-
-def episode(number: int, step_all: int | None, step_pursuers: int | None = None, **other: float) -> Episode:
-    values = {"length": 60, "return_mean": -1.5, "sigma_c": 0.25, "contacts_pursuers": 2, "contacts_obstacles": 0}
-    return Episode(number, 1000 + number, step_all, step_pursuers, **(values | other))
 
 
 def run(steps: list[int | None], **other: float) -> list[Episode]:
     """A run whose round r succeeds at ``steps[r]`` under the rule "all"."""
     return [episode(number, step, **other) for number, step in enumerate(steps)]
-
-
-def shares_run(successes: int, rounds: int, offset: int = 0) -> list[Episode]:
-    """A run with so many successes; ``offset`` makes its rounds other ones."""
-    return [episode(offset + number, 10 if number < successes else None) for number in range(rounds)]
 
 
 # one run
@@ -85,7 +77,7 @@ def test_student_by_hand() -> None:
 
 def test_a_cell_takes_students_interval_over_its_seed_means() -> None:
     # rounds enough that the seeds' spread, not the rounds, decides: Wilson at 0.9 of 1,000 is 0.0186 to each side
-    runs = {seed: shares_run(successes, 1000) for seed, successes in {5: 880, 6: 900, 7: 920}.items()}
+    runs = {seed: rounds(successes, 1000) for seed, successes in {5: 880, 6: 900, 7: 920}.items()}
     cell = metrics.summarise_cell(runs, "all")
     assert cell.success.mean == pytest.approx(0.9)
     assert cell.success.interval == pytest.approx((0.850317, 0.949683), abs=1e-6)
@@ -93,7 +85,7 @@ def test_a_cell_takes_students_interval_over_its_seed_means() -> None:
 
 
 def test_a_cells_interval_of_a_share_stays_a_share() -> None:
-    runs = {seed: shares_run(successes, 100) for seed, successes in {5: 90, 6: 100}.items()}
+    runs = {seed: rounds(successes, 100) for seed, successes in {5: 90, 6: 100}.items()}
     interval = metrics.summarise_cell(runs, "all").success.interval
     # mean 0.95, s = 0.0707, t(0.975, 1) = 12.706: 0.95 +- 0.635
     assert interval == pytest.approx((0.95 - 12.7062 * 0.05, 1.0), abs=1e-4)
@@ -101,15 +93,15 @@ def test_a_cells_interval_of_a_share_stays_a_share() -> None:
 
 def test_seeds_that_agree_exactly_keep_the_noise_of_their_rounds() -> None:
     # 90 of the same 100 rounds, three times: t has no width, Wilson's 0.9 of 100 remains (worked out above)
-    shared = metrics.summarise_cell({seed: shares_run(90, 100) for seed in range(3)}, "all")
+    shared = metrics.summarise_cell({seed: rounds(90, 100) for seed in range(3)}, "all")
     assert shared.success.interval == pytest.approx((0.825634, 0.944772), abs=2e-6)
     # three times 100 different rounds are 300
-    distinct = metrics.summarise_cell({seed: shares_run(90, 100, offset=100 * seed) for seed in range(3)}, "all")
+    distinct = metrics.summarise_cell({seed: rounds(90, 100, offset=100 * seed) for seed in range(3)}, "all")
     assert distinct.success.interval == pytest.approx(metrics.wilson_interval(0.9, 300), abs=1e-12)
 
 
 def test_seeds_that_all_win_every_round_are_not_certain() -> None:
-    interval = metrics.summarise_cell({seed: shares_run(100, 100) for seed in range(3)}, "all").success.interval
+    interval = metrics.summarise_cell({seed: rounds(100, 100) for seed in range(3)}, "all").success.interval
     assert interval is not None
     # Wilson at p = 1: low = n / (n + z^2) = 100 / 103.841459
     assert interval == pytest.approx((0.963007, 1.0), abs=1e-6)
@@ -153,8 +145,8 @@ def test_a_success_difference_on_which_the_seeds_agree_keeps_the_noise_of_its_ro
     # every seed differs by .10, so t has no width and the floor is Student's over the 1,000 rounds that all seeds play,
     # of which 100 differ by 1: s = sqrt(.1 * .9 * 1000/999) = 0.300150,
     # t(0.975, 999) = 1.962341: half 1.962341 * 0.300150 / sqrt(1000) = 0.018626
-    first = {seed: shares_run(900, 1000) for seed in range(3)}
-    second = {seed: shares_run(800, 1000) for seed in range(3)}
+    first = {seed: rounds(900, 1000) for seed in range(3)}
+    second = {seed: rounds(800, 1000) for seed in range(3)}
     difference = metrics.success_difference(first, second, "all", "all")
     assert difference is not None
     assert difference.mean == pytest.approx(0.1)
@@ -167,8 +159,8 @@ def test_a_success_difference_on_which_the_seeds_agree_keeps_the_noise_of_its_ro
 
 def test_students_interval_of_paired_differences_by_hand() -> None:
     # differences .02 .05 .08: mean .05, s = .03, half 4.302653 * .03 / sqrt(3) = .074524
-    first = {1: shares_run(820, 1000), 2: shares_run(900, 1000), 3: shares_run(980, 1000)}
-    second = {1: shares_run(800, 1000), 2: shares_run(850, 1000), 3: shares_run(900, 1000)}
+    first = {1: rounds(820, 1000), 2: rounds(900, 1000), 3: rounds(980, 1000)}
+    second = {1: rounds(800, 1000), 2: rounds(850, 1000), 3: rounds(900, 1000)}
     difference = metrics.success_difference(first, second, "all", "all")
     assert difference is not None
     assert difference.interval == pytest.approx((0.05 - 0.074524, 0.05 + 0.074524), abs=1e-6)
@@ -212,7 +204,7 @@ def test_the_length_difference_is_over_rounds_that_both_solve() -> None:
 
 def test_differences_over_other_rounds_are_refused() -> None:
     with pytest.raises(ValueError, match=r"training seed 1: .*not evaluated on the same rounds"):
-        metrics.success_difference({1: shares_run(5, 10)}, {1: shares_run(5, 10, offset=1)}, "all", "all")
+        metrics.success_difference({1: rounds(5, 10)}, {1: rounds(5, 10, offset=1)}, "all", "all")
 
 
 # do the intervals hold what they promise
@@ -253,9 +245,9 @@ def covered(intervals: list[Interval | None], share: float) -> float:
 @pytest.mark.parametrize("share", [0.75, 0.9, 0.98])
 @pytest.mark.parametrize("spread", [0.0, 0.005, 0.01])
 def test_cell_intervals_cover_in_simulated_studies(share: float, spread: float, seeds: int) -> None:
-    for rounds in (200, 1000):
-        shares = independent_study(share, spread, seeds, rounds, studies=1000)
-        intervals = [metrics.share_interval(row, rounds * seeds) for row in shares.tolist()]
+    for each in (200, 1000):
+        shares = independent_study(share, spread, seeds, each, studies=1000)
+        intervals = [metrics.share_interval(row, each * seeds) for row in shares.tolist()]
         assert covered(intervals, share) >= 0.93
     shares = shared_study(share, spread, seeds, rounds=1000, studies=300)
     assert covered([metrics.share_interval(row, 1000) for row in shares.tolist()], share) >= 0.93
@@ -272,48 +264,3 @@ def test_a_percentile_bootstrap_over_seeds_fails(seeds: int) -> None:
     every_resample = np.array(list(itertools.product(range(seeds), repeat=seeds)))
     low, high = np.percentile(shares[:, every_resample].mean(axis=2), [2.5, 97.5], axis=1)
     assert np.mean((low <= 0.9) & (high >= 0.9)) < 0.88
-
-
-# episodes.csv
-
-
-def test_episodes_come_back_exactly() -> None:
-    episodes = [
-        episode(0, 10, None, return_mean=0.1 + 0.2, sigma_c=1e-17),
-        episode(1, None, 60, return_mean=-123456.789, sigma_c=0.0),
-    ]
-    text = metrics.episodes_to_csv(episodes)
-    assert metrics.episodes_from_csv(text) == episodes
-    assert text.splitlines() == [
-        "round,seed,step_all,step_pursuers,length,return_mean,sigma_c,contacts_pursuers,contacts_obstacles",
-        "0,1000,10,,60,0.30000000000000004,1e-17,2,0",
-        "1,1001,,60,60,-123456.789,0.0,2,0",
-    ]
-
-
-def test_numpy_scalars_are_written_like_pythons() -> None:
-    plain = episode(1, 10)
-    typed = plain._replace(round=np.int64(1), step_all=np.int32(10), sigma_c=np.float64(0.25))  # type: ignore[arg-type]
-    assert metrics.episodes_to_csv([typed]) == metrics.episodes_to_csv([plain])
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "where"),
-    [
-        ("round,", "rounds,", "line 1"),
-        ("0,1000,10,,", "0,1000,10,", "line 2: 8 values for 9 columns"),
-        ("0,1000,10,", "0,1000,0,", "line 2, step_all: 0 is not within 1 to the length 60"),
-        ("0,1000,10,", "0,1000,61,", "line 2, step_all: 61 is not within"),
-        ("0,1000,10,", "0,1000,ten,", "line 2, step_all: 'ten' is not a whole number"),
-        ("0,1000,10,", "0,1000,10.5,", "line 2, step_all: '10.5' is not a whole number"),
-        ("0,1000,10,", "0,,10,", "line 2, seed: '' is not a whole number"),
-        ("0,1000,10,", "-1,1000,10,", "line 2, round: '-1' is out of range"),
-        ("-1.5,", "nan,", "line 2, return_mean: 'nan' is out of range"),
-        ("1,1001,", "0,1000,", "a round number comes twice"),
-    ],
-)
-def test_a_row_that_cannot_be_is_refused_by_line_and_column(old: str, new: str, where: str) -> None:
-    text = metrics.episodes_to_csv(run([10, None]))
-    assert old in text
-    with pytest.raises(ValueError, match=where):
-        metrics.episodes_from_csv(text.replace(old, new, 1))

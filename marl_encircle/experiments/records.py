@@ -1,0 +1,260 @@
+"""What a run leaves behind: its evaluation rounds, and the folders they are read from, hashes checked."""
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_type_hints
+
+from marl_encircle import files
+
+Closure = Literal["all", "pursuers"]
+"""Who counts for the enclosure: pursuers and obstacles, or the pursuers alone."""
+
+Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
+MAX_RUN_JSON = 1 << 20
+MAX_FILE = 1 << 28
+
+
+class Episode(NamedTuple):
+    """One evaluation round, a row of ``episodes.csv``.
+
+    :param round: number of the round within its evaluation
+    :param seed: seed the world was reset with
+    :param step_all: first step, from 1, at which the target was enclosed by pursuers and obstacles with R_m below its
+        threshold; None if never
+    :param step_pursuers: the same for an enclosure by the pursuers alone
+    :param length: steps played
+    :param return_mean: return of the round, mean over the pursuers
+    :param sigma_c: Eq. 15, population standard deviation over the pursuers of their mean contributing angle [rad]
+    :param contacts_pursuers: contacts between pursuers in the round
+    :param contacts_obstacles: contacts of pursuers with obstacles in the round
+    """
+
+    round: int
+    seed: int
+    step_all: int | None
+    step_pursuers: int | None
+    length: int
+    return_mean: float
+    sigma_c: float
+    contacts_pursuers: int
+    contacts_obstacles: int
+
+    def success_step(self, closure: Closure) -> int | None:
+        """First step, from 1, at which the closure rule held; None if never."""
+        return self.step_all if closure == "all" else self.step_pursuers
+
+
+_KINDS = get_type_hints(Episode)
+
+
+class Setting(NamedTuple):
+    """What a cell of a table is about, apart from the method.
+
+    :param speed_ratio: lambda, target speed / pursuer speed
+    :param pursuers: n
+    :param obstacles: m
+    :param scene: name of the scene
+    """
+
+    speed_ratio: float
+    pursuers: int
+    obstacles: int
+    scene: str = "random"
+
+
+class Cell(NamedTuple):
+    """One method in one setting."""
+
+    method: str
+    setting: Setting
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run folder.
+
+    :param cell: its method and setting
+    :param seed: its training seed
+    :param status: what became of it; only a finished one has rounds
+    :param closure: the method's own closure rule; None for an unfinished run
+    :param episodes: its evaluation rounds
+    """
+
+    cell: Cell
+    seed: int
+    status: Status
+    closure: Closure | None = None
+    episodes: Sequence[Episode] = ()
+
+
+def episodes_to_csv(episodes: Sequence[Episode]) -> str:
+    """Text of ``episodes.csv``: the shortest digits that give every number back exactly."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(Episode._fields)
+    for episode in episodes:
+        writer.writerow([_text(value, kind) for value, kind in zip(episode, _KINDS.values(), strict=True)])
+    return out.getvalue()
+
+
+def _text(value: float | None, kind: object) -> str:
+    """One value of a row; NumPy's scalars are written like Python's."""
+    if value is None:
+        return ""
+    return repr(float(value)) if kind is float else str(int(value))
+
+
+def episodes_from_csv(text: str) -> list[Episode]:
+    """Read ``episodes.csv``.
+
+    :param text: content of the file
+    :raises ValueError: for another header, a value of the wrong kind or out of range, with line and column; without
+        rounds; for a round number that comes twice
+    """
+    try:
+        lines = list(csv.reader(io.StringIO(text)))
+    except csv.Error as error:
+        raise ValueError(f"not CSV: {error}") from error
+    if not lines or tuple(lines[0]) != Episode._fields:
+        raise ValueError(f"line 1: the columns must be {','.join(Episode._fields)}")
+    episodes = [_episode(cells, number) for number, cells in enumerate(lines[1:], start=2)]
+    if not episodes:
+        raise ValueError("no rounds")
+    if len({episode.round for episode in episodes}) != len(episodes):
+        raise ValueError("a round number comes twice")
+    return episodes
+
+
+def _episode(cells: list[str], line: int) -> Episode:
+    """One row; its kinds are those of the fields of ``Episode``."""
+    if len(cells) != len(Episode._fields):
+        raise ValueError(f"line {line}: {len(cells)} values for {len(Episode._fields)} columns")
+    episode = Episode._make(
+        _cell(cell, kind, f"line {line}, {name}") for cell, (name, kind) in zip(cells, _KINDS.items(), strict=True)
+    )
+    for name, step in (("step_all", episode.step_all), ("step_pursuers", episode.step_pursuers)):
+        if step is not None and not 1 <= step <= episode.length:
+            raise ValueError(f"line {line}, {name}: {step} is not within 1 to the length {episode.length}")
+    return episode
+
+
+def _cell(cell: str, kind: object, where: str) -> int | float | None:
+    """One value of a row."""
+    if cell == "" and kind == int | None:
+        return None
+    try:
+        value = float(cell) if kind is float else int(cell)
+    except ValueError:
+        raise ValueError(f"{where}: {cell[:80]!r} is not a {'number' if kind is float else 'whole number'}") from None
+    if not (math.isfinite(value) if kind is float else 0 <= value < 1 << 63):
+        raise ValueError(f"{where}: {cell[:80]!r} is out of range")
+    return value
+
+
+def run_path(cell: Cell, seed: int) -> Path:
+    """Where a run lies in the folder of all runs: ``<method>/ratio<lambda>_n<n>_m<m>_<scene>/seed<s>``."""
+    ratio, pursuers, obstacles, scene = cell.setting
+    return Path(cell.method, f"ratio{float(ratio)!r}_n{pursuers}_m{obstacles}_{scene}", f"seed{seed}")
+
+
+def read_runs(folder: str | Path) -> list[Run]:
+    """Read every run folder below a folder, hashes checked.
+
+    :param folder: e.g. ``results/runs``; a missing one has no runs
+    :return: runs in the order of method, setting, seed
+    :raises files.DamagedFileError: for a folder that is no run folder or a file that is not what the run wrote, by name
+    """
+    runs = [
+        _read_run(seed_folder, Cell(method_folder.name, _setting(setting_folder)), _seed(seed_folder))
+        for method_folder in _subfolders(Path(folder))
+        for setting_folder in _subfolders(method_folder)
+        for seed_folder in _subfolders(setting_folder)
+    ]
+    return sorted(runs, key=lambda run: (run.cell, run.seed))
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    """Folders in a folder; names that start with a dot are not ours."""
+    if not folder.is_dir():
+        return []
+    return [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
+
+
+def _setting(folder: Path) -> Setting:
+    match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", folder.name)
+    if match is None:
+        raise files.DamagedFileError(folder, "the name of a setting's folder is ratio<lambda>_n<n>_m<m>_<scene>")
+    return Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
+
+
+def _seed(folder: Path) -> int:
+    match = re.fullmatch(r"seed(\d+)", folder.name)
+    if match is None:
+        raise files.DamagedFileError(folder, "the name of a run's folder is seed<number>")
+    return int(match[1])
+
+
+def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
+    """Read one run folder; without ``run.json``, which is written last, the run is unfinished."""
+    path = folder / "run.json"
+    if not path.exists():
+        return Run(cell, seed, "unfinished")
+    try:
+        record = json.loads(files.read_bytes(path, max_bytes=MAX_RUN_JSON))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, files.DamagedFileError):
+            raise
+        raise files.DamagedFileError(path, f"not JSON: {error}") from error
+    closure, hashes = _checked(path, record, cell, seed)
+    contents = {name: files.read_bytes(folder / name, sha256=value, max_bytes=MAX_FILE) for name, value in hashes}
+    if record["status"] == "diverged":
+        return Run(cell, seed, "diverged", closure)
+    if "episodes.csv" not in contents:
+        if (folder / "episodes.csv").exists():
+            raise files.DamagedFileError(folder / "episodes.csv", "its hash is not in run.json")
+        return Run(cell, seed, "not evaluated", closure)
+    try:
+        episodes = episodes_from_csv(contents["episodes.csv"].decode("utf-8"))
+    except ValueError as error:
+        raise files.DamagedFileError(folder / "episodes.csv", str(error)) from error
+    return Run(cell, seed, "finished", closure, tuple(episodes))
+
+
+def _checked(path: Path, record: Any, cell: Cell, seed: int) -> tuple[Closure, list[tuple[str, str]]]:
+    """Closure rule and hashes of a ``run.json`` that belongs where it lies."""
+
+    def expect(holds: bool, reason: str) -> None:
+        if not holds:
+            raise files.DamagedFileError(path, reason)
+
+    expect(isinstance(record, dict), "not a JSON object")
+    missing = [key for key in ("status", "method", "seed", "config", "sha256") if key not in record]
+    expect(not missing, f"missing: {', '.join(missing)}")
+    for key, expected in (("method", cell.method), ("seed", seed)):
+        expect(record[key] == expected, f"{key} is {record[key]!r:.80}, in the folder of {expected!r}")
+    expect(
+        record["status"] in ("finished", "diverged"), f"status is {record['status']!r:.80}, not finished or diverged"
+    )
+    config = record["config"]
+    expect(isinstance(config, dict) and isinstance(config.get("reward"), dict), "config.reward is missing")
+    scenario = config.get("scenario")
+    for key, expected in cell.setting._asdict().items():
+        if isinstance(scenario, dict) and key in scenario:
+            value = scenario[key]
+            expect(value == expected, f"config.scenario.{key} is {value!r:.80}, in the folder of {expected!r}")
+    closure = config["reward"].get("closure")
+    if closure not in ("all", "pursuers"):
+        raise files.DamagedFileError(path, f"config.reward.closure is {closure!r:.80}, not 'all' or 'pursuers'")
+    hashes = record["sha256"]
+    expect(
+        isinstance(hashes, dict) and all(isinstance(value, str) for value in hashes.values()), "sha256 is no mapping"
+    )
+    for name in hashes:
+        expect(re.fullmatch(r"\w[\w.-]*", name) is not None, f"sha256 has {name!r:.80}, which is no plain file name")
+    return closure, sorted(hashes.items())

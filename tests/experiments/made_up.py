@@ -1,0 +1,47 @@
+"""Made-up evaluation rounds and run folders, written through the package's own writer."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from marl_encircle import files
+from marl_encircle.experiments import records
+from marl_encircle.experiments.records import Cell, Closure, Episode
+
+
+def episode(number: int, step_all: int | None, step_pursuers: int | None = None, **other: float) -> Episode:
+    """A round; everything that a test does not name has a plain value."""
+    values = {"length": 60, "return_mean": -1.5, "sigma_c": 0.25, "contacts_pursuers": 2, "contacts_obstacles": 0}
+    return Episode(number, 1000 + number, step_all, step_pursuers, **(values | other))  # type: ignore[arg-type]
+
+
+def rounds(successes: int, total: int, step: int = 20, offset: int = 0) -> list[Episode]:
+    """A run with so many successes under both rules; ``offset`` makes its rounds other ones."""
+    steps = [step if number < successes else None for number in range(total)]
+    return [episode(offset + number, at, at) for number, at in enumerate(steps)]
+
+
+def write_run(
+    folder: Path,
+    cell: Cell,
+    seed: int,
+    episodes: Sequence[Episode] | None,
+    closure: Closure = "all",
+    status: str = "finished",
+) -> Path:
+    """Write a run folder; None leaves the rounds out. Returns the run's folder."""
+    run = folder / records.run_path(cell, seed)
+    texts = {"policy.safetensors": f"weights {seed}\n", "progress.csv": "world_steps,success\n0,0.0\n"}
+    if episodes is not None:
+        texts["episodes.csv"] = records.episodes_to_csv(episodes)
+    for name, text in texts.items():
+        files.write_text(run / name, text)
+    record = {
+        "schema": 1,
+        "status": status,
+        "method": cell.method,
+        "config": {"reward": {"name": cell.method, "closure": closure}, "scenario": cell.setting._asdict()},
+        "seed": seed,
+        "sha256": {name: files.sha256_file(run / name) for name in texts},
+    }
+    files.write_json(run / "run.json", record)
+    return run

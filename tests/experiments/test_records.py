@@ -1,0 +1,174 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_up import episode, write_run
+
+from marl_encircle import files
+from marl_encircle.experiments import records
+from marl_encircle.experiments.records import Cell, Run, Setting
+
+CELL = Cell("ours", Setting(1.1, 3, 1))
+
+
+def test_episodes_come_back_exactly() -> None:
+    episodes = [
+        episode(0, 10, None, return_mean=0.1 + 0.2, sigma_c=1e-17),
+        episode(1, None, 60, return_mean=-123456.789, sigma_c=0.0),
+    ]
+    text = records.episodes_to_csv(episodes)
+    assert records.episodes_from_csv(text) == episodes
+    assert text.splitlines() == [
+        "round,seed,step_all,step_pursuers,length,return_mean,sigma_c,contacts_pursuers,contacts_obstacles",
+        "0,1000,10,,60,0.30000000000000004,1e-17,2,0",
+        "1,1001,,60,60,-123456.789,0.0,2,0",
+    ]
+
+
+def test_numpy_scalars_are_written_like_pythons() -> None:
+    plain = episode(1, 10)
+    typed = plain._replace(round=np.int64(1), step_all=np.int32(10), sigma_c=np.float64(0.25))  # type: ignore[arg-type]
+    assert records.episodes_to_csv([typed]) == records.episodes_to_csv([plain])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("round,", "rounds,", "line 1"),
+        ("0,1000,10,,", "0,1000,10,", "line 2: 8 values for 9 columns"),
+        ("0,1000,10,", "0,1000,0,", "line 2, step_all: 0 is not within 1 to the length 60"),
+        ("0,1000,10,", "0,1000,61,", "line 2, step_all: 61 is not within"),
+        ("0,1000,10,", "0,1000,ten,", "line 2, step_all: 'ten' is not a whole number"),
+        ("0,1000,10,", "0,1000,10.5,", "line 2, step_all: '10.5' is not a whole number"),
+        ("0,1000,10,", "0,,10,", "line 2, seed: '' is not a whole number"),
+        ("0,1000,10,", "-1,1000,10,", "line 2, round: '-1' is out of range"),
+        ("-1.5,", "nan,", "line 2, return_mean: 'nan' is out of range"),
+        ("1,1001,", "0,1000,", "a round number comes twice"),
+        ("1000", "9" * 400, "line 2, seed: .* is out of range"),
+        ("1000", "1" * 200_000, "not CSV"),
+        ("\n0,1000,10,,60,-1.5,0.25,2,0\n1,1001,,,60,-1.5,0.25,2,0", "", "no rounds"),
+    ],
+)
+def test_a_row_that_cannot_be_is_refused_by_line_and_column(old: str, new: str, where: str) -> None:
+    text = records.episodes_to_csv([episode(0, 10), episode(1, None)])
+    assert old in text
+    with pytest.raises(ValueError, match=where):
+        records.episodes_from_csv(text.replace(old, new, 1))
+
+
+# run folders
+
+
+def test_a_run_comes_back_from_its_folder(tmp_path: Path) -> None:
+    episodes = (episode(0, 10, 12), episode(1, None))
+    model_a = Cell("model_a", Setting(1.25, 2, 0, "tunnel"))
+    write_run(tmp_path, CELL, 10, episodes)
+    write_run(tmp_path, CELL, 9, episodes[:1])
+    write_run(tmp_path, model_a, 0, episodes, closure="pursuers")
+    assert records.read_runs(tmp_path) == [
+        Run(model_a, 0, "finished", "pursuers", episodes),
+        Run(CELL, 9, "finished", "all", episodes[:1]),
+        Run(CELL, 10, "finished", "all", episodes),
+    ]
+    assert (tmp_path / "model_a" / "ratio1.25_n2_m0_tunnel" / "seed0" / "run.json").exists()
+
+
+def test_no_folder_has_no_runs(tmp_path: Path) -> None:
+    assert records.read_runs(tmp_path / "none") == []
+
+
+def test_what_is_no_result_is_told_apart(tmp_path: Path) -> None:
+    write_run(tmp_path, CELL, 0, (), status="diverged")
+    write_run(tmp_path, CELL, 1, None)
+    (write_run(tmp_path, CELL, 2, (episode(0, 10),)) / "run.json").unlink()
+    assert [(run.seed, run.status, run.episodes) for run in records.read_runs(tmp_path)] == [
+        (0, "diverged", ()),
+        (1, "not evaluated", ()),
+        (2, "unfinished", ()),
+    ]
+
+
+def test_files_beside_the_folders_and_hidden_folders_are_not_runs(tmp_path: Path) -> None:
+    write_run(tmp_path, CELL, 0, (episode(0, 10),))
+    (tmp_path / ".cache").mkdir()
+    (tmp_path / "README.md").touch()
+    (tmp_path / "ours" / "notes.txt").touch()
+    assert len(records.read_runs(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("name", ["ours/ratio1.1_n3/seed0", "ours/ratio1.1_n3_m1_random/0", "ours/x/seed0"])
+def test_a_folder_of_another_name_is_an_error_that_names_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(files.DamagedFileError, match="the name of a"):
+        records.read_runs(tmp_path)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["episodes.csv", "policy.safetensors", "progress.csv"])
+def test_an_edited_file_is_found_by_its_hash(tmp_path: Path, name: str) -> None:
+    path = write_run(tmp_path, CELL, 0, (episode(0, None),)) / name
+    edit(path, path.read_text()[-2], "1")
+    with pytest.raises(files.DamagedFileError, match=f"{name}: changed since it was written") as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
+
+
+def test_a_missing_file_is_found(tmp_path: Path) -> None:
+    path = write_run(tmp_path, CELL, 0, (episode(0, None),)) / "episodes.csv"
+    path.unlink()
+    with pytest.raises(files.DamagedFileError, match="missing") as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
+
+
+def test_rounds_that_nobody_vouches_for_are_refused(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, CELL, 0, None)
+    (folder / "episodes.csv").write_text(records.episodes_to_csv([episode(0, 10)]))
+    with pytest.raises(files.DamagedFileError, match=r"episodes.csv: its hash is not in run\.json"):
+        records.read_runs(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda record: record.pop("sha256"), "missing: sha256"),
+        (lambda record: record.update(status="done"), "status is 'done'"),
+        (lambda record: record.update(method="model_b"), "method is 'model_b', in the folder of 'ours'"),
+        (lambda record: record.update(seed=1), "seed is 1, in the folder of 0"),
+        (lambda record: record.update(config=[]), "config.reward is missing"),
+        (lambda record: record["config"]["reward"].update(closure="any"), "config.reward.closure is 'any'"),
+        (
+            lambda record: record["config"]["scenario"].update(obstacles=0),
+            "config.scenario.obstacles is 0, in the folder of 1",
+        ),
+        (lambda record: record.update(sha256={"../../secret": "0"}), "no plain file name"),
+        (lambda record: record.update(sha256={"episodes.csv": 0}), "sha256 is no mapping"),
+    ],
+)
+def test_a_run_json_that_does_not_belong_there_is_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], reason: str
+) -> None:
+    path = write_run(tmp_path, CELL, 0, (episode(0, 10),)) / "run.json"
+    record = json.loads(path.read_text())
+    change(record)
+    files.write_json(path, record)
+    with pytest.raises(files.DamagedFileError, match=reason) as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"[" * 100_000, b" " * (1 << 21)])
+def test_a_run_json_that_is_none_is_refused(tmp_path: Path, data: bytes) -> None:
+    path = write_run(tmp_path, CELL, 0, (episode(0, 10),)) / "run.json"
+    path.write_bytes(data)
+    with pytest.raises(files.DamagedFileError) as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
