@@ -1,0 +1,94 @@
+# The one door for people and CI. Every target sets up .venv first if it has to, then calls one command or one tool.
+
+BASE_PYTHON ?= python3
+PIP_ARGS    ?=
+PYTEST_ARGS ?=
+
+REWARD      ?= ours
+SPEED_RATIO ?= 1.1
+PURSUERS    ?= 3
+OBSTACLES   ?= 1
+SCENE       ?= random
+SEED        ?= 0
+JOBS        ?= $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
+GRID        ?= committed
+RESULTS     ?= results
+RUN         ?= $(RESULTS)/runs/$(basename $(notdir $(REWARD)))/ratio$(SPEED_RATIO)_n$(PURSUERS)_m$(OBSTACLES)_$(SCENE)/seed$(SEED)
+
+BIN    := .venv/bin
+PYTHON := $(BIN)/python
+CLI    := $(BIN)/marl-encircle
+READY  := .venv/.ready
+
+# One thread per process: runs are parallel by process, and results are promised per thread count.
+export OMP_NUM_THREADS := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test test-sb3 check lint format format-check typecheck imports spelling \
+        train evaluate sweep tables reproduce-tables bench tensorboard clean
+
+help:  ## list the targets and the variables
+	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / {printf "  %-18s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+	@echo
+	@echo "  REWARD=$(REWARD) SPEED_RATIO=$(SPEED_RATIO) PURSUERS=$(PURSUERS) OBSTACLES=$(OBSTACLES)" \
+	      "SCENE=$(SCENE) SEED=$(SEED)"
+	@echo "  JOBS=$(JOBS) GRID=$(GRID) RESULTS=$(RESULTS) PIP_ARGS=$(PIP_ARGS) PYTEST_ARGS=$(PYTEST_ARGS)"
+
+setup: $(READY)  ## make .venv with the versions of constraints.txt (PIP_ARGS goes to pip)
+
+$(READY): pyproject.toml constraints.txt
+	$(BASE_PYTHON) -m venv .venv
+	$(PYTHON) -m pip install $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+	@touch $@
+
+test: $(READY)  ## the tests (PYTEST_ARGS goes to pytest)
+	$(PYTHON) -m pytest -n 2 $(PYTEST_ARGS)
+
+test-sb3: $(READY)  ## Stable-Baselines3's own tests on MADDPG and MATD3
+	$(PYTHON) tests/sb3_suite.py
+
+check: lint format-check typecheck imports spelling  ## all checks that run no code of ours
+
+lint: $(READY)  ## ruff's rules
+	$(BIN)/ruff check
+
+format: $(READY)  ## format the code
+	$(BIN)/ruff format
+
+format-check: $(READY)  ## is the code formatted
+	$(BIN)/ruff format --check
+
+typecheck: $(READY)  ## mypy, strict
+	$(BIN)/mypy
+
+imports: $(READY)  ## the layers
+	$(BIN)/lint-imports
+
+spelling: $(READY)  ## codespell
+	$(BIN)/codespell
+
+train: $(READY)  ## one training run: REWARD SPEED_RATIO PURSUERS OBSTACLES SCENE SEED RESULTS
+	$(CLI) train --reward $(REWARD) --speed-ratio $(SPEED_RATIO) --pursuers $(PURSUERS) --obstacles $(OBSTACLES) \
+	  --scene $(SCENE) --seed $(SEED) --out $(RESULTS)/runs
+
+evaluate: $(READY)  ## evaluate that run, or RUN=its folder
+	$(CLI) evaluate $(RUN)
+
+sweep: $(READY)  ## train and evaluate what is missing of GRID: GRID JOBS RESULTS
+	$(CLI) sweep $(GRID) --jobs $(JOBS) --out $(RESULTS)/runs
+
+tables: $(READY)  ## render the tables from the runs there are: RESULTS
+	$(CLI) tables --out $(RESULTS)
+
+reproduce-tables: $(READY)  ## the whole road: train, evaluate, render: GRID JOBS RESULTS
+	$(CLI) reproduce-tables --grid $(GRID) --out $(RESULTS) --jobs $(JOBS)
+
+bench: $(READY)  ## measure the speed, into benchmarks/results.json
+	$(CLI) bench
+
+tensorboard: $(READY)  ## watch the runs in a browser: RESULTS
+	$(BIN)/tensorboard --logdir $(RESULTS)/runs
+
+clean:  ## remove caches and builds; .venv and results stay
+	rm -rf build dist .cache .coverage* .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -name .venv -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf

@@ -1,0 +1,53 @@
+"""The Makefile is the door for people and CI: every target is listed, sets up first, and passes its variables on."""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "Makefile").read_text(encoding="utf-8")
+TARGETS = re.findall(r"^([a-z][a-z0-9-]*):", TEXT, flags=re.MULTILINE)
+
+
+def make(*arguments: str) -> str:
+    """Output of make; ``-n`` among the arguments shows the commands without running them."""
+    command = ["make", "--no-print-directory", *arguments]
+    environment = {"PATH": os.environ["PATH"]}  # not the variables of the make that runs the tests
+    result = subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True, timeout=60)
+    return result.stdout
+
+
+def test_help_is_the_default_and_lists_every_target() -> None:
+    listed = re.findall(r"^  ([a-z][a-z0-9-]*)  +\w", make(), flags=re.MULTILINE)
+    assert listed == TARGETS
+    assert {"setup", "test", "test-sb3", "check", "bench", "reproduce-tables"} <= set(listed)
+    assert make() == make("help")
+
+
+def test_every_target_is_phony() -> None:
+    [names] = re.findall(r"^\.PHONY: ((?:.*\\\n)*.*)$", TEXT, flags=re.MULTILINE)
+    assert set(names.replace("\\", "").split()) == set(TARGETS)
+
+
+@pytest.mark.parametrize("target", sorted(set(TARGETS) - {"help", "clean"}))
+def test_every_target_sets_up_first(target: str) -> None:
+    commands = make("-n", "-W", "pyproject.toml", "PIP_ARGS=--offered", target)
+    assert "-m pip install --offered -c constraints.txt -e '.[dev]'" in commands
+
+
+def test_variables_reach_the_command() -> None:
+    shown = make(
+        "-n", "train", "REWARD=my/own.yaml", "SPEED_RATIO=1.3", "PURSUERS=4", "OBSTACLES=2", "SCENE=tunnel", "SEED=7"
+    )
+    command = " ".join(shown.replace("\\\n", " ").split())
+    assert command.endswith(
+        "train --reward my/own.yaml --speed-ratio 1.3 --pursuers 4 --obstacles 2"
+        " --scene tunnel --seed 7 --out results/runs"
+    )
+    shown = make("-n", "evaluate", "REWARD=my/own.yaml", "SPEED_RATIO=1.3", "SEED=7", "RESULTS=elsewhere")
+    assert shown.strip().endswith("evaluate elsewhere/runs/own/ratio1.3_n3_m1_random/seed7")
+    shown = make("-n", "reproduce-tables", "GRID=smoke", "RESULTS=elsewhere", "JOBS=3")
+    assert shown.strip().endswith("reproduce-tables --grid smoke --out elsewhere --jobs 3")
