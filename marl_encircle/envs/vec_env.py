@@ -8,11 +8,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
-from marl_encircle.core.observations import bounds, observe
-from marl_encircle.core.rewards import Reward, Transition
-from marl_encircle.core.rounds import Rounds
+from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.core.simulator import Difficulty, Simulator, world_seeds
+from marl_encircle.core.simulator import Difficulty, world_seeds
+from marl_encircle.envs.arena import ACTION_SIZE, Arena
 
 
 class EncirclementVecEnv(VecEnv):
@@ -42,14 +41,12 @@ class EncirclementVecEnv(VecEnv):
         self.n_worlds, self.n_agents = n_worlds, self.scenario.pursuers
         self.agents = list(self.scenario.agents)
         self.render_mode = None
-        self.simulator = Simulator(self.scenario, n_worlds)
-        self.rounds = Rounds(self.scenario, self.terms.closure, n_worlds)
-        self._actions = np.zeros((n_worlds, self.n_agents, 2))
-        low, high = bounds(self.scenario)
+        self._arena = Arena(self.scenario, self.terms, n_worlds)
+        self.simulator, self.rounds = self._arena.simulator, self._arena.rounds
         super().__init__(
             num_envs=n_worlds * self.n_agents,
-            observation_space=spaces.Box(low, high),
-            action_space=spaces.Box(-1.0, 1.0, (2,)),
+            observation_space=spaces.Box(self._arena.low, self._arena.high),
+            action_space=spaces.Box(-1.0, 1.0, (ACTION_SIZE,)),
         )
         if seed is not None:
             self.seed(seed)
@@ -77,9 +74,7 @@ class EncirclementVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        self.simulator.reset()
-        self.rounds.start(np.arange(self.n_worlds))
-        return self._slots(self._observe())
+        return self._slots(self._arena.reset())
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for ``step_wait``.
@@ -98,17 +93,8 @@ class EncirclementVecEnv(VecEnv):
         :return: observations (B * N, O), rewards (B * N,), dones (B * N,), infos
         :raises ValueError: for an action that is not finite, naming world and pursuer
         """
-        sim = self.simulator
-        measure = sim.step(self._actions)
-        transition = Transition(
-            self.scenario, sim.state, self._actions, measure, sim.former_measure, self.terms.closure
-        )
-        shares = self.terms.parts(transition)
-        self.rounds.add(sim.steps, measure, shares)
-        rewards = sum(shares.values(), np.zeros((self.n_worlds, self.n_agents)))
-        terminated = transition.enclosure.complete
-        done = terminated | (sim.steps >= self.scenario.max_cycles)
-        observations = self._observe()
+        observations, rewards, terminated, truncated = self._arena.step(self._actions)
+        done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         worlds = np.flatnonzero(done)
         if len(worlds):
@@ -117,19 +103,12 @@ class EncirclementVecEnv(VecEnv):
                 for i in range(self.n_agents):
                     infos[b * self.n_agents + i] = {
                         "is_success": bool(terminated[b]),
-                        "TimeLimit.truncated": not terminated[b],
+                        "TimeLimit.truncated": bool(truncated[b]),
                         "terminal_observation": observations[b, i].copy(),
                         "round": figures,
                     }
-            sim.reset(worlds)
-            self.rounds.start(worlds)
-            observe(sim, observations, worlds)
-        return (
-            self._slots(observations),
-            rewards.astype(np.float32).ravel(),
-            np.repeat(done, self.n_agents),
-            infos,
-        )
+            self._arena.restart(worlds, observations)
+        return self._slots(observations), rewards.ravel(), np.repeat(done, self.n_agents), infos
 
     def close(self) -> None:
         """Do nothing: there is nothing to give back."""
@@ -164,13 +143,7 @@ class EncirclementVecEnv(VecEnv):
         """
         self.simulator.set_state(saved["simulator"])
         self.rounds.set_state(saved["rounds"])
-        return self._slots(self._observe())
-
-    def _observe(self) -> NDArray[np.float32]:
-        size = self.observation_space.shape or (0,)
-        observations = np.empty((self.n_worlds, self.n_agents, *size), np.float32)
-        observe(self.simulator, observations)
-        return observations
+        return self._slots(self._arena.observe())
 
     def _slots(self, per_world: NDArray[np.float32]) -> NDArray[np.float32]:
         return per_world.reshape(self.num_envs, -1)

@@ -1,0 +1,85 @@
+"""What every road to the ecosystem does in a step: move the worlds, reward the pursuers, tell which rounds are over."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_encircle.core.observations import bounds, observe
+from marl_encircle.core.rewards import Reward, Transition
+from marl_encircle.core.rounds import Rounds
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.simulator import Simulator
+
+ACTION_SIZE = 2
+"""U: an acceleration, or a velocity in first-order dynamics, along x and y."""
+
+
+class Outcome(NamedTuple):
+    """One step of B worlds, in arrays of its own."""
+
+    observations: NDArray[np.float32]
+    """After the step, (B, N, O)."""
+    rewards: NDArray[np.float32]
+    """Of each pursuer, (B, N)."""
+    terminated: NDArray[np.bool_]
+    """Whether the encirclement is complete under the reward's closure rule, (B,)."""
+    truncated: NDArray[np.bool_]
+    """Whether the round is cut at ``scenario.max_cycles`` without success, (B,)."""
+
+
+class Arena:
+    """B worlds together with the reward and the record of their rounds.
+
+    :param scenario: the rules
+    :param reward: the reward, and the closure rule that ends a round
+    :param n_worlds: B
+    """
+
+    def __init__(self, scenario: Scenario, reward: Reward, n_worlds: int) -> None:
+        self.scenario, self.reward = scenario, reward
+        self.simulator = Simulator(scenario, n_worlds)
+        self.rounds = Rounds(scenario, reward.closure, n_worlds)
+        self.low, self.high = bounds(scenario)
+        self._everywhere = np.arange(n_worlds)
+
+    def observe(self) -> NDArray[np.float32]:
+        """Return what all pursuers see now, (B, N, O)."""
+        observations = np.empty((self.simulator.n_worlds, self.scenario.pursuers, len(self.low)), np.float32)
+        observe(self.simulator, observations, self._everywhere)
+        return observations
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start a new round in every world.
+
+        :return: what all pursuers see first, (B, N, O)
+        """
+        self.simulator.reset()
+        self.rounds.start(self._everywhere)
+        return self.observe()
+
+    def restart(self, worlds: NDArray[np.int64], observations: NDArray[np.float32]) -> None:
+        """Start a new round in some worlds.
+
+        :param worlds: their indices, (W,)
+        :param observations: of all worlds; those of ``worlds`` are overwritten, (B, N, O)
+        """
+        self.simulator.reset(worlds)
+        self.rounds.start(worlds)
+        observe(self.simulator, observations, worlds)
+
+    def step(self, actions: ArrayLike) -> Outcome:
+        """Move all worlds by one step.
+
+        :param actions: in [-1, 1], (B, N, 2)
+        :raises ValueError: for an action that is not finite, naming world and pursuer; nothing moves then
+        """
+        actions = np.asarray(actions, np.float64)
+        sim, closure = self.simulator, self.reward.closure
+        measure = sim.step(actions)
+        shares = self.reward.parts(Transition(self.scenario, sim.state, actions, measure, sim.former_measure, closure))
+        self.rounds.add(sim.steps, measure, shares)
+        rewards = sum(shares.values(), np.zeros(actions.shape[:2]))
+        terminated = measure.enclosure[closure].complete.copy()
+        truncated = (sim.steps >= self.scenario.max_cycles) & ~terminated
+        return Outcome(self.observe(), rewards.astype(np.float32), terminated, truncated)
