@@ -9,8 +9,8 @@ Three kinds of interval, not to be mixed:
 - one cell, ``summarise_cell``: Student's t over the means of the training seeds, cut to [0, 1] where the value is a
   share, and never narrower than the noise of the evaluation rounds themselves. That floor matters when the seeds happen
   to agree (in the extreme, all the same: t has no width then) and when all seeds play the same rounds: luck with the
-  rounds moves all of them together, so the spread between seeds cannot show it. The floor counts a round that several
-  seeds play once.
+  rounds moves all of them together, so the spread between seeds cannot show it. A share's floor is Wilson's interval for
+  the rounds of one seed, another mean's is Student's over the distinct rounds.
 - two methods, ``success_difference`` and ``length_difference``: the same over the paired differences, round by round
   and seed by seed. "No difference shown" where the interval covers zero.
 
@@ -251,23 +251,23 @@ def _student_quantile(freedom: int) -> float:
     return float(stats.t.ppf(0.5 + CONFIDENCE / 2, freedom))
 
 
-def share_interval(seed_shares: Sequence[float], distinct_rounds: int) -> Interval | None:
+def share_interval(seed_shares: Sequence[float], rounds: int) -> Interval | None:
     """Interval of a mean share over training seeds: Student's t, at least as wide as Wilson's, cut to [0, 1].
 
     :param seed_shares: share of each training seed, in [0, 1]
-    :param distinct_rounds: different rounds the seeds were evaluated on, a round that several seeds play counted once
+    :param rounds: rounds that each seed played, be they the same for all or not
     :return: None with fewer than two seeds
     """
     interval = student_interval(seed_shares)
     if interval is None:
         return None
-    return _hull(interval, *wilson_interval(float(np.mean(seed_shares)), distinct_rounds), bounds=(0.0, 1.0))
+    return _hull(interval, *wilson_interval(float(np.mean(seed_shares)), rounds), bounds=(0.0, 1.0))
 
 
 def _share(seeds: Sequence[Rounds]) -> Estimate:
     """Estimate of a share."""
     means = [_mean(rounds) for rounds in seeds]
-    return Estimate(float(np.mean(means)), share_interval(means, len(_by_round(seeds))), len(means))
+    return Estimate(float(np.mean(means)), share_interval(means, min(map(len, seeds))), len(means))
 
 
 def _estimate(seeds: Sequence[Rounds], bounds: tuple[float, float] = UNBOUNDED) -> Estimate:
