@@ -9,14 +9,14 @@ Three kinds of interval, not to be mixed:
 - one cell, ``summarise_cell``: Student's t over the means of the training seeds, cut to [0, 1] where the value is a
   share, and never narrower than the noise of the evaluation rounds themselves. That floor matters when the seeds happen
   to agree (in the extreme, all the same: t has no width then) and when all seeds play the same rounds: luck with the
-  rounds moves all of them together, so the spread between seeds cannot show it. A share's floor is Wilson's interval for
-  the rounds of one seed, another mean's is Student's over the distinct rounds.
+  rounds moves all of them together, so the spread between seeds cannot show it. A share's floor is Wilson's interval
+  for the rounds of one seed, another mean's is Student's over the distinct rounds.
 - two methods, ``success_difference`` and ``length_difference``: the same over the paired differences, round by round
   and seed by seed. "No difference shown" where the interval covers zero.
 
 A percentile bootstrap over three to five seeds is far too narrow and is not used; the tests show both. The limit of the
 cell's interval: where the seeds spread as widely as their distance to 100 % (98 % on average with 2 points of spread),
-three to five of them rarely include the bad one, and it covers 85 to 89 % instead of 95 %.
+three to five of them rarely include the bad one, and it covers about 88 % instead of 95 %.
 """
 
 import math
