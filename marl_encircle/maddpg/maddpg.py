@@ -3,7 +3,6 @@
 import io
 import pathlib
 import warnings
-from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -26,6 +25,7 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.utils import FloatSchedule, should_collect_more_steps
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from torch import nn
+from torch.nn import functional
 
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
@@ -226,12 +226,14 @@ class MADDPG(OffPolicyAlgorithm):
 
             # The targets y_i = r_i + gamma Q'_i(s', mu'_1(o'_1) .. mu'_n(o'_n)) of Eq. 3; termination cuts the future
             with th.no_grad():
-                next_q_values, _ = self.critic_target(batch.next_observations, self._target_actions(batch)).min(dim=0)
+                next_q_values = self.critic_target(batch.next_observations, self._target_actions(batch)).amin(dim=0)
                 target_q_values = batch.rewards.T + (1 - batch.dones.T) * self.gamma * next_q_values
 
             # Critics: minimise the mean of (y_i - Q_i(s, a_1 .. a_n))^2, Eq. 3
             q_values = self.critic(batch.observations, batch.actions)
-            critic_loss = (q_values - target_q_values).square().mean(-1).sum()
+            critic_loss = (
+                functional.mse_loss(q_values, target_q_values.expand_as(q_values), reduction="sum") / batch_size
+            )
             self._optimize(self.critic, critic_loss)
             critic_losses.append(critic_loss.detach())
 
@@ -239,14 +241,13 @@ class MADDPG(OffPolicyAlgorithm):
                 # Actors: ascend the mean of Q_i(s, a_1 .. mu_i(o_i) .. a_n), Eq. 2
                 logits = self.actor.logits(batch.observations)
                 q_values = self.critic.own_action_values(batch.observations, batch.actions, th.tanh(logits))
-                actor_loss = -q_values.mean(-1).sum()
-                penalty = self.actor_regularization * logits.square().mean((0, 2)).sum()
+                actor_loss = -q_values.sum() / batch_size
+                penalty = self.actor_regularization * logits.square().mean(dim=(0, 2)).sum()
                 self._optimize(self.actor, actor_loss + penalty)
                 actor_losses.append(actor_loss.detach())
 
                 # Targets follow slowly
-                polyak_update(self.critic, self.critic_target, self.tau)
-                polyak_update(self.actor, self.actor_target, self.tau)
+                self.policy.update_targets(self.tau)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if actor_losses:
@@ -260,9 +261,9 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _optimize(self, network: Actor | CentralCritic, loss: th.Tensor) -> None:
         """One gradient step on the parameters of ``network`` alone."""
-        parameters = list(network.parameters())
-        network.optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+        parameters = network.optimizer.param_groups[0]["params"]
+        for parameter, grad in zip(parameters, th.autograd.grad(loss, parameters), strict=True):
+            parameter.grad = grad
         if self.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         network.optimizer.step()
@@ -495,12 +496,3 @@ def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
     if isinstance(env, VecEnv) and (n < 1 or env.num_envs % n):
         raise ValueError(f"{env.num_envs} slots are no whole number of worlds with n_agents={n}")
     return n
-
-
-@th.no_grad()
-def polyak_update(network: nn.Module, target: nn.Module, tau: float) -> None:
-    """Move the target's parameters by the share ``tau`` towards the network's, and copy its buffers."""
-    th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
-    copies: Sequence[tuple[th.Tensor, th.Tensor]] = list(zip(target.buffers(), network.buffers(), strict=True))
-    for target_buffer, buffer in copies:
-        target_buffer.copy_(buffer)

@@ -20,7 +20,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from marl_encircle.maddpg.networks import AgentFeatures, QNetwork, StackedMLP
+from marl_encircle.maddpg.networks import AgentFeatures, StackedMLP
 
 CriticKind = Literal["per_agent", "shared"]
 
@@ -30,15 +30,16 @@ class AgentModel(BaseModel):
 
     features_extractor: BaseFeaturesExtractor
 
-    def agent_features(self, obs: th.Tensor) -> th.Tensor:
+    def agent_features(self, obs: th.Tensor, dtype: th.dtype) -> th.Tensor:
         """Features of the joint observation.
 
         :param obs: observations, shape (B, N, *O)
+        :param dtype: the networks' precision
         :return: shape (B, N, features)
         """
         inputs = preprocess_obs(obs, self.observation_space, normalize_images=self.normalize_images)
         assert isinstance(inputs, th.Tensor)
-        features: th.Tensor = self.features_extractor(inputs.to(next(self.parameters()).dtype))
+        features: th.Tensor = self.features_extractor(inputs.to(dtype))
         return features
 
 
@@ -80,8 +81,8 @@ class Actor(AgentModel, BasePolicy):
         self.features_dim = features_dim
         self.activation_fn = activation_fn
         self.share_parameters = share_parameters
-        layer_dims = [*net_arch, get_action_dim(action_space)]
-        self.mu = StackedMLP(1 if share_parameters else n_agents, features_dim, layer_dims, activation_fn)
+        n_networks = 1 if share_parameters else n_agents
+        self.mu = StackedMLP(n_networks, features_dim, net_arch, get_action_dim(action_space), activation_fn)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
@@ -98,7 +99,7 @@ class Actor(AgentModel, BasePolicy):
 
         :param obs: observations, shape (B, N, *O)
         """
-        logits: th.Tensor = self.mu(self.agent_features(obs).transpose(0, 1))
+        logits: th.Tensor = self.mu(self.agent_features(obs, self.mu.dtype).transpose(0, 1))
         return logits.transpose(0, 1)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
@@ -155,11 +156,19 @@ class CentralCritic(AgentModel):
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         input_dim = n_agents * (features_dim + get_action_dim(action_space))
+        n_networks = 1 if kind == "shared" else n_agents
         self.q_networks = nn.ModuleList(
-            QNetwork(n_agents, input_dim, net_arch, activation_fn, shared=kind == "shared") for _ in range(n_critics)
+            StackedMLP(n_networks, input_dim, net_arch, 1, activation_fn, n_heads=n_agents) for _ in range(n_critics)
         )
-        self.own_agent: th.Tensor  # (N, 1, N, 1): row i is true at agent i
-        self.register_buffer("own_agent", th.eye(n_agents, dtype=th.bool)[:, None, :, None], persistent=False)
+        # (N, 1, N * U), row i is true at the action of agent i
+        self.own_action: th.Tensor
+        own_action = th.eye(n_agents, dtype=th.bool).repeat_interleave(get_action_dim(action_space), dim=1)
+        self.register_buffer("own_action", own_action[:, None], persistent=False)
+
+    @property
+    def dtype(self) -> th.dtype:
+        """The networks' precision."""
+        return next(self.q_networks.parameters()).dtype
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Estimates of Q_i(s, a_1 ... a_N) of every agent i, shape (n_critics, N, B).
@@ -167,8 +176,9 @@ class CentralCritic(AgentModel):
         :param obs: observations, shape (B, N, *O)
         :param actions: actions in [-1, 1], shape (B, N, U)
         """
-        x = th.cat([self.agent_features(obs).flatten(1), actions.flatten(1)], dim=-1)
-        return th.stack([q_network(x[None]) for q_network in self.q_networks])
+        features = self.agent_features(obs, self.dtype).flatten(1)
+        x = th.cat([features, actions.flatten(1).to(self.dtype)], dim=-1)
+        return th.stack([q_network(x[None]).squeeze(-1) for q_network in self.q_networks])
 
     def own_action_values(self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor) -> th.Tensor:
         """First estimate of Q_i(s, a_1 .. a_i = mu_i(o_i) .. a_N) of every agent i, shape (N, B).
@@ -177,10 +187,10 @@ class CentralCritic(AgentModel):
         :param actions: actions in [-1, 1] that the other agents keep, shape (B, N, U)
         :param own_actions: the action that agent i takes where Q_i is asked, shape (B, N, U)
         """
-        features = self.agent_features(obs).flatten(1).expand(len(self.own_agent), -1, -1)
-        x = th.cat([features, th.where(self.own_agent, own_actions, actions).flatten(2)], dim=-1)
-        q_values: th.Tensor = self.q_networks[0](x)
-        return q_values
+        features = self.agent_features(obs, self.dtype).flatten(1).expand(len(self.own_action), -1, -1)
+        joint_actions = th.where(self.own_action, own_actions.flatten(1), actions.flatten(1))
+        q_values: th.Tensor = self.q_networks[0](th.cat([features, joint_actions], dim=-1), constant=True)
+        return q_values.squeeze(-1)
 
 
 class MADDPGPolicy(BasePolicy):
@@ -259,6 +269,26 @@ class MADDPGPolicy(BasePolicy):
                 lr=lr_schedule(1),  # type: ignore[call-arg]
                 **self.optimizer_kwargs,
             )
+        # Walking through the modules at every update would take longer than the update of the targets itself
+        networks, targets = (
+            nn.ModuleList([self.actor, self.critic]),
+            nn.ModuleList([self.actor_target, self.critic_target]),
+        )
+        self._parameter_lists = list(targets.parameters()), list(networks.parameters())
+        pairs = zip(targets.modules(), networks.modules(), strict=True)
+        self._buffer_owners = [(target, network) for target, network in pairs if target._buffers]
+
+    @th.no_grad()
+    def update_targets(self, tau: float) -> None:
+        """Move the targets by the share ``tau`` towards the networks (Polyak), and copy running statistics.
+
+        :param tau: share, in [0, 1]
+        """
+        target_parameters, parameters = self._parameter_lists
+        th._foreach_lerp_(target_parameters, parameters, tau)  # type: ignore[arg-type]
+        for target, network in self._buffer_owners:
+            for name, buffer in network.named_buffers(recurse=False):
+                getattr(target, name).copy_(buffer)
 
     def make_features_extractor(self) -> AgentFeatures:
         """SB3's extractor for one observation, copied for every agent if it learns."""
