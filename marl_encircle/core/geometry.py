@@ -127,7 +127,7 @@ def enclose(
             square = x * x + y * y
             if square < TINY * TINY:  # a pursuer on the target has no bearing; it blocks a cone around the x axis
                 x, y, square = TINY, 0.0, TINY * TINY
-            _meet(x / square, y / square, 1.0 / (speed_ratio[b] ** 2 * square), rays, met)
+            _meet(x / square, y / square, (1.0 - 1.0 / speed_ratio[b] ** 2) / square, rays, met)
             _keep_nearest(i, met, nearness[1, b], owner[1, b])
         owner[0, b] = owner[1, b]
         nearness[0, b] = nearness[1, b]
@@ -135,7 +135,7 @@ def enclose(
             x, y = discs[b, d, 0] - target[b, 0], discs[b, d, 1] - target[b, 1]
             reach = discs[b, d, 2] + physics.target_radius
             scale = 1.0 / max(x * x + y * y - reach * reach, TINY)
-            _meet(x * scale, y * scale, (reach * scale) ** 2, rays, met)
+            _meet(x * scale, y * scale, scale, rays, met)
             _keep_nearest(n + d // discs_per_unit, met, nearness[0, b], owner[0, b])
         for rule in range(2):
             owned = _share_out(owner[rule, b], contributing_angle[rule, b])
@@ -146,17 +146,18 @@ def enclose(
 
 
 @kernel
-def _meet(x: float, y: float, square_radius: float, rays: Array, met: Array) -> None:
+def _meet(x: float, y: float, square_tangent: float, rays: Array, met: Array) -> None:
     """Fill in the nearness at which each direction meets the inverted circle around (x, y); nan or 0 if not at all.
 
-    A line through the target meets it on one side only, so that a direction and its opposite share the square root.
+    The target's tangents to the inverted circle give it without the radius, which loses digits at ratios near 1:
+    sqrt(1 - 1 / lambda^2) / d for a pursuer, 1 / sqrt(d^2 - R^2) for a disc. A line through the target meets it on one
+    side only, so that a direction and its opposite share the square root.
     """
     half = rays.shape[1]
     ahead, behind = met[:half], met[half:]
     for k in range(half):
         along = rays[0, k] * x + rays[1, k] * y
-        across = rays[0, k] * y - rays[1, k] * x
-        root = np.sqrt(square_radius - across * across)
+        root = np.sqrt(along * along - square_tangent)
         ahead[k] = root + along if along > 0.0 else 0.0
         behind[k] = root - along if along < 0.0 else 0.0
 

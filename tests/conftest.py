@@ -1,0 +1,12 @@
+"""Hypothesis profiles: ``quick`` by default, HYPOTHESIS_PROFILE=thorough for 1,000 examples of each law."""
+
+import os
+
+from hypothesis import HealthCheck, settings
+
+settings.register_profile("quick", max_examples=25, deadline=None, derandomize=True, database=None)
+unhurried = [HealthCheck.too_slow, HealthCheck.filter_too_much]
+settings.register_profile(
+    "thorough", max_examples=1000, deadline=None, suppress_health_check=unhurried, print_blob=True
+)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
