@@ -48,6 +48,8 @@ def observe(simulator: Simulator, out: NDArray[np.float32], worlds: NDArray[np.i
     things = state.obstacles if scenario.composite_unit else np.ascontiguousarray(state.discs[:, :, :2])
     softening = scenario.direction_softening if scenario.observe_directions else 0.0
     _observe(worlds, state.pursuers, state.velocities, state.target, things, softening, out)
+    if not scenario.observe_extras:
+        return
     share = simulator.measure.enclosure["all"].occupied_angle / (2 * np.pi)
     extras = {
         "occupied_angle": share,

@@ -64,7 +64,7 @@ def contributing_angle(t: Transition) -> Array:
 
 def obstacle_angle(t: Transition) -> Array:
     """Share of the circle that all obstacles contribute: r_o of Eq. 12. In [0, 1], (B, N)."""
-    return _for_all(t, t.enclosure.contributing_angle[:, t.pursuers :].sum(axis=1) / CIRCLE)
+    return _for_all(t, np.add.reduce(t.enclosure.contributing_angle[:, t.pursuers :], axis=1) / CIRCLE)
 
 
 def contraction(t: Transition, *, cap: float = 20 / 3) -> Array:
@@ -119,7 +119,7 @@ def phase_difference(t: Transition) -> Array:
 
 
 def _for_all(t: Transition, shared: Array) -> Array:
-    return np.broadcast_to(shared[:, None], t.measure.target_distance.shape)
+    return shared[:, None].repeat(t.pursuers, axis=1)
 
 
 TERMS: dict[str, Callable[..., Array]] = {

@@ -6,6 +6,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_encircle.core.compilation import kernel
 from marl_encircle.core.geometry import Closure, Measure
 from marl_encircle.core.scenario import Scenario
 
@@ -35,7 +36,8 @@ class Rounds:
         self.contacts_obstacles = np.zeros(n_worlds, np.int64)
         self._occupied_angle = np.zeros(n_worlds)
         self._contributing_angle = np.zeros((n_worlds, scenario.pursuers))
-        self._terms: dict[str, Array] = {}
+        self._terms: tuple[str, ...] = ()
+        self._term_sums = np.zeros((0, n_worlds))
 
     @property
     def complete(self) -> NDArray[np.bool_]:
@@ -46,40 +48,52 @@ class Rounds:
     def start(self, worlds: NDArray[np.int64]) -> None:
         """Forget the former round of some worlds."""
         counters = (self.length, self.contacts_pursuers, self.contacts_obstacles, *self.success_step.values())
-        sums = (self.returns, self._occupied_angle, self._contributing_angle, *self._terms.values())
-        for array in (*counters, *sums):
+        for array in (*counters, self.returns, self._occupied_angle, self._contributing_angle):
             array[worlds] = 0
+        self._term_sums[:, worlds] = 0
 
-    def add(self, step: NDArray[np.int64], measure: Measure, shares: Mapping[str, Array]) -> None:
+    def add(self, step: NDArray[np.int64], measure: Measure, shares: Mapping[str, Array]) -> Array:
         """Take in one step of all worlds.
 
         :param step: number of the step in its round, from 1, (B,)
         :param measure: after the step
-        :param shares: each reward term's share, (B, N) each
+        :param shares: each reward term's share, (B, N) each; the same terms at every step
+        :return: the sum of the shares, the rewards of this step, (B, N)
         """
-        running = ~self.complete
-        everybody = running[:, None]
+        if tuple(shares) != self._terms:
+            if self._terms:
+                raise ValueError(f"shares of {', '.join(shares)} after shares of {', '.join(self._terms)}")
+            self._terms = tuple(shares)
+            self._term_sums = np.zeros((len(shares), len(self.length)))
         enclosure = measure.enclosure[self.closure]
-        self.length += running
-        self._occupied_angle += running * enclosure.occupied_angle
-        self._contributing_angle += everybody * enclosure.contributing_angle[:, : self.returns.shape[1]]
-        self.contacts_pursuers += running * measure.contacts_pursuers.sum(axis=1)
-        self.contacts_obstacles += running * measure.contacts_obstacles.sum(axis=1)
-        for name, share in shares.items():
-            if name not in self._terms:
-                self._terms[name] = np.zeros(len(running))
-            self.returns += everybody * share
-            self._terms[name] += running * share.mean(axis=1)
-        for rule, first in self.success_step.items():
-            now = measure.enclosure[rule].complete & (first == NEVER)
-            first[now] = step[now]
+        rewards = np.zeros(self.returns.shape)
+        _add(
+            step,
+            measure.enclosure["all"].complete,
+            measure.enclosure["pursuers"].complete,
+            enclosure.occupied_angle,
+            enclosure.contributing_angle,
+            measure.contacts_pursuers,
+            measure.contacts_obstacles,
+            np.concatenate([self.returns[:0], *shares.values()]),
+            self.complete,
+            self.success_step["all"],
+            self.success_step["pursuers"],
+            self.length,
+            self._occupied_angle,
+            self._contributing_angle,
+            self.contacts_pursuers,
+            self.contacts_obstacles,
+            self.returns,
+            self._term_sums,
+            rewards,
+        )
+        return rewards
 
     @property
     def contribution_spread(self) -> Array:
         """sigma_c: standard deviation over the pursuers of theta_c averaged over the round (Eq. 15) [rad], (B,)."""
-        mean = self._contributing_angle / np.maximum(self.length, 1)[:, None]
-        spread: Array = mean.std(axis=1)
-        return spread
+        return self._spread(slice(None))
 
     def summary(self, world: int) -> dict[str, float]:
         """Return one round's figures by the names under which they are logged."""
@@ -89,16 +103,16 @@ class Rounds:
             "success_pursuers": float(self.success_step["pursuers"][world] != NEVER),
             "length": float(length),
             "occupied_angle": float(self._occupied_angle[world]) / length,
-            "sigma_c": float(self.contribution_spread[world]),
+            "sigma_c": float(self._spread(slice(world, world + 1))[0]),
             "contacts_pursuers": float(self.contacts_pursuers[world]),
             "contacts_obstacles": float(self.contacts_obstacles[world]),
-            **{f"reward/{name}": float(total[world]) for name, total in self._terms.items()},
+            **dict(zip((f"reward/{name}" for name in self._terms), self._term_sums[:, world].tolist(), strict=True)),
         }
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return copies of all running figures by name."""
         arrays: dict[str, NDArray[Any]] = {f"success_{rule}": a for rule, a in self.success_step.items()}
-        arrays |= {f"term_{name}": a for name, a in self._terms.items()}
+        arrays |= {f"term_{name}": a for name, a in zip(self._terms, self._term_sums, strict=True)}
         for name in ("length", "returns", "contacts_pursuers", "contacts_obstacles"):
             arrays[name] = getattr(self, name)
         arrays |= {"occupied_angle": self._occupied_angle, "contributing_angle": self._contributing_angle}
@@ -106,10 +120,69 @@ class Rounds:
 
     def set_state(self, saved: Mapping[str, NDArray[Any]]) -> None:
         """Go on from what :meth:`get_state` returned."""
-        self._terms = {key.removeprefix("term_"): saved[key].copy() for key in saved if key.startswith("term_")}
+        self._terms = tuple(key.removeprefix("term_") for key in saved if key.startswith("term_"))
+        self._term_sums = np.array([saved[f"term_{name}"] for name in self._terms]).reshape(-1, len(self.length))
         for rule, first in self.success_step.items():
             first[:] = saved[f"success_{rule}"]
         for name in ("length", "returns", "contacts_pursuers", "contacts_obstacles"):
             getattr(self, name)[:] = saved[name]
         self._occupied_angle[:] = saved["occupied_angle"]
         self._contributing_angle[:] = saved["contributing_angle"]
+
+    def _spread(self, worlds: slice) -> Array:
+        mean = self._contributing_angle[worlds] / np.maximum(self.length[worlds], 1)[:, None]
+        spread: Array = mean.std(axis=1)
+        return spread
+
+
+@kernel
+def _add(
+    step: NDArray[np.int64],
+    complete_all: NDArray[np.bool_],
+    complete_pursuers: NDArray[np.bool_],
+    occupied_angle: Array,
+    contributing_angle: Array,
+    contacts_pursuers: NDArray[np.int64],
+    contacts_obstacles: NDArray[np.int64],
+    shares: Array,
+    over: NDArray[np.bool_],
+    success_all: NDArray[np.int64],
+    success_pursuers: NDArray[np.int64],
+    length: NDArray[np.int64],
+    occupied_angle_sum: Array,
+    contributing_angle_sum: Array,
+    contacts_pursuers_sum: NDArray[np.int64],
+    contacts_obstacles_sum: NDArray[np.int64],
+    returns: Array,
+    term_sums: Array,
+    rewards: Array,
+) -> None:
+    """Add one step's figures to those of the rounds that are not ``over``, and note first successes, in place.
+
+    :param shares: (T * B, N), term by term
+    :param term_sums: means over the pursuers, (T, B)
+    :param rewards: to add up the shares in, of all rounds, (B, N)
+    """
+    n_worlds, n = returns.shape
+    for b in range(n_worlds):
+        if complete_all[b] and success_all[b] == NEVER:
+            success_all[b] = step[b]
+        if complete_pursuers[b] and success_pursuers[b] == NEVER:
+            success_pursuers[b] = step[b]
+        for t in range(len(term_sums)):
+            for i in range(n):
+                rewards[b, i] += shares[t * n_worlds + b, i]
+        if over[b]:
+            continue
+        length[b] += 1
+        occupied_angle_sum[b] += occupied_angle[b]
+        for i in range(n):
+            contributing_angle_sum[b, i] += contributing_angle[b, i]
+            contacts_pursuers_sum[b] += contacts_pursuers[b, i]
+            contacts_obstacles_sum[b] += contacts_obstacles[b, i]
+            returns[b, i] += rewards[b, i]
+        for t in range(len(term_sums)):
+            total = 0.0
+            for i in range(n):
+                total += shares[t * n_worlds + b, i]
+            term_sums[t, b] += total / n

@@ -78,8 +78,7 @@ class Arena:
         sim, closure = self.simulator, self.reward.closure
         measure = sim.step(actions)
         shares = self.reward.parts(Transition(self.scenario, sim.state, actions, measure, sim.former_measure, closure))
-        self.rounds.add(sim.steps, measure, shares)
-        rewards = sum(shares.values(), np.zeros(actions.shape[:2]))
+        rewards = self.rounds.add(sim.steps, measure, shares)
         terminated = measure.enclosure[closure].complete.copy()
         truncated = (sim.steps >= self.scenario.max_cycles) & ~terminated
         return Outcome(self.observe(), rewards.astype(np.float32), terminated, truncated)
