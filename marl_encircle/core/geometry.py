@@ -53,7 +53,7 @@ class Enclosure(NamedTuple):
     @property
     def distance(self) -> Array:
         """Way to the contributor along each direction, inf where nobody is met [scene units], (B, K)."""
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             return 1.0 / self.nearness
 
     @property

@@ -15,7 +15,7 @@ Points = Sequence[Sequence[float]]
 
 def arranged(
     pursuers: Points,
-    target: Sequence[float] = (0.0, 0.0),
+    target_at: Sequence[float] = (0.0, 0.0),
     discs: Points = (),
     velocities: Points | None = None,
     **fields: Any,
@@ -27,7 +27,7 @@ def arranged(
     saved = sim.get_state()
     state = saved["state"]
     state["pursuers"][0] = pursuers
-    state["target"][0] = target
+    state["target"][0] = target_at
     state["velocities"][0] = 0.0 if velocities is None else velocities
     state["discs"][0] = np.reshape(np.array(discs, dtype=float), (-1, 3))
     state["obstacles"][0] = state["discs"][0, :, :2]

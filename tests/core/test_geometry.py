@@ -130,6 +130,7 @@ def test_the_near_point_and_the_tangent_have_the_known_distance() -> None:
 
 @example(x=0.3, y=0.4, ratio=1.0)
 @example(x=0.3, y=0.4, ratio=1 + 1e-12)
+@example(x=5e-324, y=1.0, ratio=1.0)
 @given(x=st.floats(-2, 2), y=st.floats(0.01, 2), ratio=st.floats(1, 5))
 def test_distances_have_twelve_digits_away_from_the_tangent(x: float, y: float, ratio: float) -> None:
     distance = rule(Layout(((x, y),), (), ratio), n_directions=360).distance[0]
