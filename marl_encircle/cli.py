@@ -1,0 +1,330 @@
+"""The ``marl-encircle`` command.
+
+Exit codes: 0 done, 1 a run failed, 2 wrong configuration or usage, 3 a damaged or unfit file, 128 + n stopped by
+signal n.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from marl_encircle import files
+from marl_encircle.core.simulator import PlacementError
+from marl_encircle.experiments.build import Engine, load_run
+from marl_encircle.experiments.callbacks import Stopped
+from marl_encircle.experiments.config import PACKAGE, Config, Profile, difference, load_config, reward_names
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.grid import load_grid
+from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.experiments.reproduce import reproduce, write_tables
+from marl_encircle.experiments.sweep import Progress, sweep
+from marl_encircle.experiments.train import train, write_episodes
+from marl_encircle.experiments.yaml_files import ConfigError
+
+app = typer.Typer(
+    name="marl-encircle",
+    help="Encircle a faster target: train, evaluate and compare, and reproduce Zheng et al. (2023).",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+config_app = typer.Typer(no_args_is_help=True, help="Show, compare and check configurations.")
+app.add_typer(config_app, name="config")
+
+Reward = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
+SpeedRatio = Annotated[float, typer.Option(help="Target speed / pursuer speed.")]
+Pursuers = Annotated[int, typer.Option(help="Number of pursuers.")]
+Obstacles = Annotated[int, typer.Option(help="Number of obstacles.")]
+Scene = Annotated[str, typer.Option(help="What an obstacle looks like: random, concave or tunnel.")]
+Algorithm = Annotated[str, typer.Option(help="maddpg, matd3, or the path of a YAML file.")]
+ProfileOption = Annotated[Profile, typer.Option(help="full, or smoke for a few seconds.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override: section.key=value. May be repeated.")]
+Out = Annotated[Path, typer.Option(help="Folder of runs.")]
+Results = Annotated[Path, typer.Option(help="Folder of runs/ and tables/.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Runs at a time, one processor core each.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
+) -> None:
+    """Keep what concerns every command."""
+    os.environ["MARL_ENCIRCLE_DEBUG"] = "1" if debug else ""
+
+
+@app.command("train")
+def train_command(
+    reward: Reward = "ours",
+    speed_ratio: SpeedRatio = 1.1,
+    pursuers: Pursuers = 3,
+    obstacles: Obstacles = 1,
+    scene: Scene = "random",
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Training seed.")] = 0,
+    algorithm: Algorithm = "maddpg",
+    engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
+    profile: ProfileOption = "full",
+    overrides: Set = None,
+    out: Out = Path("results/runs"),
+    checkpoint_every: Annotated[float, typer.Option(min=1.0, help="Seconds between checkpoints.")] = 120.0,
+    tensorboard: Annotated[bool, typer.Option(help="Write event files into the run folder.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Train one run, evaluate it, and print its folder; an interrupted one goes on where it stopped.
+
+    Example: marl-encircle train --reward ablations/my_idea.yaml --pursuers 4 --set training.world_steps=200000
+    """
+    config = _config(reward, speed_ratio, pursuers, obstacles, scene, algorithm, profile, overrides)
+    folder, worked = train(
+        config,
+        seed,
+        engine,
+        out,
+        checkpoint_every=checkpoint_every,
+        progress_bar=not quiet,
+        tensorboard=tensorboard,
+    )
+    if not worked:
+        typer.echo("already finished", err=True)
+    typer.echo(str(folder))
+
+
+@app.command()
+def evaluate(
+    run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Rounds to play.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Evaluation seed.")] = 1000,
+    as_json: AsJson = False,
+    write: Annotated[bool, typer.Option("--write", help="Replace the run's episodes.csv.")] = False,
+) -> None:
+    """Play fresh rounds with a trained policy, noise off, and print how they ended."""
+    policy, config, record = load_run(run_dir)
+    rounds = play_rounds(policy, config, episodes, seed)
+    closure = config.reward.closure
+    own = summarise_run(rounds, closure)
+    scenario = config.scenario
+    result = {
+        "method": config.reward.name,
+        "speed_ratio": scenario.speed_ratio,
+        "pursuers": scenario.pursuers,
+        "obstacles": scenario.obstacles,
+        "scene": scenario.scene,
+        "train_seed": record["seed"],
+        "eval_seed": seed,
+        "episodes": episodes,
+        "closure": closure,
+        "success": own.success,
+        "success_low": own.success_interval.low,
+        "success_high": own.success_interval.high,
+        "mean_episode_length": own.mean_episode_length,
+        "success_all": summarise_run(rounds, "all").success,
+        "success_pursuers": summarise_run(rounds, "pursuers").success,
+        "sigma_c": own.sigma_c,
+        "policy_sha256": record["sha256"]["policy.safetensors"],
+    }
+    if write:
+        write_episodes(run_dir, rounds)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        _print_pairs(result)
+
+
+@app.command("sweep")
+def sweep_command(
+    grid: Annotated[str, typer.Argument(help="committed, smoke, all, or the path of a YAML file.")],
+    jobs: Jobs = 1,
+    out: Out = Path("results/runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Train every run of a grid that is missing."""
+    with _live() as report:
+        progress = sweep(load_grid(grid).jobs, out, jobs, report)
+    counts = {
+        "done": progress.done,
+        "running": len(progress.running),
+        "failed": len(progress.failed),
+        "diverged": progress.diverged,
+        "left": progress.left,
+    }
+    if as_json:
+        typer.echo(json.dumps(counts))
+    else:
+        _print_pairs(counts)
+    _exit_if_failed(progress)
+
+
+@app.command()
+def tables(
+    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
+    out: Results = Path("results"),
+) -> None:
+    """Render the tables from the runs there are."""
+    for path in write_tables(load_grid(grid), out):
+        typer.echo(str(path))
+
+
+@app.command("reproduce-tables")
+def reproduce_tables(
+    grid: Annotated[str, typer.Option(help="committed, smoke, all, or the path of a YAML file.")] = "committed",
+    out: Results = Path("results"),
+    jobs: Jobs = 1,
+) -> None:
+    """Train and evaluate what is missing of a grid, and render Tables 1-4 beside the paper's numbers."""
+    with _live() as report:
+        done = reproduce(grid, out, jobs, report)
+    for number in (2, 3, 4):
+        typer.echo((out / "tables" / f"table{number}.md").read_text())
+    typer.echo(f"trained={done.trained} evaluated={done.evaluated} reused={done.reused}")
+    _exit_if_failed(done.sweep)
+
+
+@app.command()
+def bench() -> None:
+    """Measure the speed rows and write benchmarks/results.json; needs a checkout."""
+    script = PACKAGE.parent / "benchmarks" / "run.py"
+    if not script.exists():
+        raise ConfigError("bench needs a checkout of the repository; this installation has no benchmarks/run.py")
+    raise typer.Exit(subprocess.run([sys.executable, str(script)], check=False).returncode)
+
+
+@config_app.command("show")
+def config_show(
+    reward: Reward = "ours",
+    speed_ratio: SpeedRatio = 1.1,
+    pursuers: Pursuers = 3,
+    obstacles: Obstacles = 1,
+    scene: Scene = "random",
+    algorithm: Algorithm = "maddpg",
+    profile: ProfileOption = "full",
+    overrides: Set = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print a resolved configuration; the reward as a table of terms and weights."""
+    config = _config(reward, speed_ratio, pursuers, obstacles, scene, algorithm, profile, overrides)
+    values = config.to_dict()
+    if as_json:
+        typer.echo(json.dumps(values, indent=2))
+        return
+    console = Console()
+    console.print(_reward_table(config))
+    for section in ("scenario", "algorithm", "training", "evaluation"):
+        table = Table("key", "value", title=section)
+        for key, value in values[section].items():
+            table.add_row(key, str(value))
+        console.print(table)
+    console.print(f"methods: {', '.join(reward_names())}")
+
+
+@config_app.command("diff")
+def config_diff(first: str, second: str, profile: ProfileOption = "full") -> None:
+    """Print what differs between two methods."""
+    here, there = (load_config(name, profile=profile).to_dict() for name in (first, second))
+    for line in difference(here, there):
+        typer.echo(line.replace(" here", f" in {first}").replace(" there", f" in {second}"))
+
+
+@config_app.command("validate")
+def config_validate(path: Annotated[str, typer.Argument(help="A method's name or the path of a YAML file.")]) -> None:
+    """Check a method's file; say nothing but 'valid', or what is wrong with it (exit code 2)."""
+    load_config(path)
+    typer.echo("valid")
+
+
+def _config(
+    reward: str,
+    speed_ratio: float,
+    pursuers: int,
+    obstacles: int,
+    scene: str,
+    algorithm: str,
+    profile: Profile,
+    overrides: list[str] | None,
+) -> Config:
+    scenario = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
+    return load_config(reward, algorithm=algorithm, profile=profile, scenario=scenario, overrides=overrides or ())
+
+
+def _reward_table(config: Config) -> Table:
+    r = config.reward
+    title = f"{r.name}: closure {r.closure}, {'two stages' if r.two_stage else 'one stage'}, scale {r.scale:g}"
+    table = Table("term", "weight", "parameters", title=title)
+    for name, (weight, parameters) in r.build().active.items():
+        table.add_row(name, f"{weight:g}", ", ".join(f"{key}={value:g}" for key, value in parameters.items()))
+    return table
+
+
+def _print_pairs(values: dict[str, Any]) -> None:
+    width = max(map(len, values))
+    for key, value in values.items():
+        typer.echo(f"{key:<{width}}  {value:.4f}" if isinstance(value, float) else f"{key:<{width}}  {value}")
+
+
+class _live:  # noqa: N801 - used like a function
+    """A table of where a sweep stands on the terminal; one line per change where there is no terminal."""
+
+    def __enter__(self) -> Any:
+        self.console = Console(stderr=True)
+        self.live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
+        self.last = ""
+        if self.live:
+            self.live.start()
+        return self.report
+
+    def __exit__(self, *error: object) -> None:
+        if self.live:
+            self.live.stop()
+
+    def report(self, progress: Progress) -> None:
+        """Show the present state."""
+        line = (
+            f"done {progress.done}, diverged {progress.diverged}, failed {len(progress.failed)}, left {progress.left}"
+            f"{'; running: ' + ', '.join(progress.running) if progress.running else ''}"
+        )
+        if line == self.last:
+            return
+        self.last = line
+        if self.live:
+            self.live.update(line, refresh=True)
+        else:
+            self.console.print(line, soft_wrap=True)
+
+
+def _exit_if_failed(progress: Progress) -> None:
+    for name in progress.failed:
+        typer.echo(f"failed: {name}", err=True)
+    if progress.failed:
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Run the command; errors become one message and an exit code."""
+    try:
+        app()
+    except (ConfigError, PlacementError, files.FolderLockedError) as error:
+        _fail(error, 2)
+    except files.DamagedFileError as error:
+        _fail(error, 3)
+    except Stopped as stopped:
+        _fail(stopped, 128 + stopped.signum)
+    except OSError as error:
+        _fail(error, 1)
+
+
+def _fail(error: Exception, code: int) -> None:
+    if os.environ.get("MARL_ENCIRCLE_DEBUG"):
+        raise error
+    typer.echo(f"error: {error}" if not isinstance(error, Stopped) else str(error), err=True)
+    raise SystemExit(code)
+
+
+if __name__ == "__main__":
+    main()

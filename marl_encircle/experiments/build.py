@@ -1,0 +1,204 @@
+"""Configuration -> objects: the environment that trains, the model, and a trained policy read back."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import safetensors.torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+
+from marl_encircle import files
+from marl_encircle.core.observations import bounds
+from marl_encircle.envs import encirclement_v0
+from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
+from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
+from marl_encircle.envs.vec_env import EncirclementVecEnv
+from marl_encircle.experiments.config import AlgorithmConfig, Config, Profile, Schedule, load_config
+from marl_encircle.maddpg import MADDPG, MATD3
+from marl_encircle.maddpg.policies import MADDPGPolicy
+
+Engine = Literal["native", "supersuit"]
+
+ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3}
+"""Algorithms by the ``name`` in their configuration."""
+
+MAX_POLICY_BYTES = 1 << 26
+
+
+def make_vec_env(
+    reward: str = "ours",
+    n_worlds: int = 64,
+    *,
+    engine: Engine = "native",
+    seed: int | None = None,
+    curriculum: bool = True,
+    profile: Profile = "full",
+    overrides: Sequence[str] = (),
+    **scenario: Any,
+) -> VecEnv:
+    """Return worlds to train in: ``n_worlds * pursuers`` slots, monitored, with the setting's curriculum.
+
+    :param reward: a method's name or the path of its YAML file
+    :param n_worlds: worlds side by side
+    :param engine: ``native``, fast, or ``supersuit``, the PettingZoo environment through SuperSuit; equal seeds give
+        equal trajectories
+    :param seed: of the worlds; without one they start from fresh entropy
+    :param curriculum: start easy and become final over world steps, as the training section says; without it the
+        worlds are final from the start, for evaluation
+    :param profile: see :func:`marl_encircle.experiments.config.load_config`
+    :param overrides: ``section.key=value`` each
+    :param scenario: fields of ``Scenario``, for example ``pursuers=3, obstacles=1, speed_ratio=1.1``
+    :raises ConfigError: for an unknown name or a value that is not allowed
+    """
+    config = load_config(reward, profile=profile, scenario=scenario, overrides=overrides)
+    env = build_vec_env(config, n_worlds, engine, curriculum=curriculum)
+    if seed is not None:
+        env.seed(seed)
+    return env
+
+
+def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, curriculum: bool = True) -> VecEnv:
+    """Return the environment that a configuration trains in."""
+    scenario, reward = config.scenario, config.reward.build()
+    worlds: VecEnv
+    if engine == "native":
+        worlds = EncirclementVecEnv(scenario, reward, n_worlds)
+    else:
+        worlds = SuperSuitVecEnv(lambda: encirclement_v0.parallel_env(scenario, reward), n_worlds)
+    levels: dict[str, Level] = {
+        name: Level(ramp.start, getattr(scenario, name), ramp.world_steps)
+        for name, ramp in config.training.curriculum.items()
+        if ramp is not None and curriculum
+    }
+    return VecMonitor(CurriculumVecEnv(worlds, levels))
+
+
+def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG:
+    """Return the untrained model of a configuration; world steps become SB3's agent steps here.
+
+    :param env: the environment to train in
+    :param seed: of the networks, the exploration, the replay sampling and the environment
+    :param kwargs: passed on to the algorithm
+    """
+    a, n = config.algorithm, config.scenario.pursuers
+    # A buffer larger than the training would only cost memory.
+    buffer_world_steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
+    return ALGORITHMS[a.name](
+        "MlpPolicy",
+        env,
+        learning_rate=a.learning_rate,
+        buffer_size=buffer_world_steps * n,
+        learning_starts=a.random_world_steps * n,
+        batch_size=a.batch_size,
+        tau=a.tau,
+        gamma=a.gamma,
+        train_freq=a.vec_steps_per_training,
+        gradient_steps=a.updates_per_training,
+        critic=a.critic,
+        exploration_noise=NoiseSchedule(a.exploration_noise, config.training.world_steps),
+        exploration_random=a.exploration_random,
+        policy_delay=a.policy_delay,
+        max_grad_norm=a.max_grad_norm,
+        actor_regularization=a.actor_regularization,
+        policy_kwargs={"net_arch": list(a.net_arch)},
+        seed=seed,
+        device="cpu",
+        **kwargs,
+    )
+
+
+class NoiseSchedule:
+    """SB3 asks with the progress that remains, 1 to 0; the configuration counts world steps.
+
+    :param schedule: from ``start`` to ``end`` over its world steps
+    :param world_steps: of the whole training
+    """
+
+    def __init__(self, schedule: Schedule, world_steps: int) -> None:
+        self.level = Level(schedule.start, schedule.end, schedule.world_steps)
+        self.world_steps = world_steps
+
+    def __call__(self, progress_remaining: float) -> float:
+        """Return the standard deviation of the exploration noise."""
+        return self.level.at(round((1.0 - progress_remaining) * self.world_steps))
+
+
+def build_policy(config: Config) -> MADDPGPolicy:
+    """Return an untrained policy for a configuration's scenario, to load weights into."""
+    low, high = bounds(config.scenario)
+    algorithm: AlgorithmConfig = config.algorithm
+    return MADDPGPolicy(
+        spaces.Box(low, high),
+        spaces.Box(-1.0, 1.0, (2,)),
+        lambda _: algorithm.learning_rate,
+        n_agents=config.scenario.pursuers,
+        critic=algorithm.critic,
+        net_arch=list(algorithm.net_arch),
+    )
+
+
+def policy_bytes(policy: MADDPGPolicy) -> bytes:
+    """Return the actors' weights as safetensors; equal weights give equal bytes."""
+    return safetensors.torch.save(policy.actor_state_dict())
+
+
+def load_policy(run_folder: str | Path) -> MADDPGPolicy:
+    """Return the trained policy of a run folder, checked against its recorded hash.
+
+    Reads JSON and safetensors only: nothing in a run folder can run code.
+
+    :param run_folder: a folder that ``marl-encircle train`` wrote
+    :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
+    """
+    policy, _, _ = load_run(run_folder)
+    return policy
+
+
+def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
+    """Return a finished run's policy, configuration and record; see :func:`load_policy`."""
+    folder = Path(run_folder)
+    record = read_record(folder)
+    path = folder / "policy.safetensors"
+    try:
+        config = config_of(record)
+        data = files.read_bytes(path, sha256=record["sha256"]["policy.safetensors"], max_bytes=MAX_POLICY_BYTES)
+    except (KeyError, TypeError) as error:
+        raise files.DamagedFileError(folder / "run.json", f"has no {error}") from error
+    policy = build_policy(config)
+    try:
+        tensors = safetensors.torch.load(data)
+        policy.actor.load_state_dict(tensors)
+    except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
+        raise files.DamagedFileError(path, f"does not hold this policy's weights: {str(error)[:200]}") from error
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise files.DamagedFileError(path, "has weights that are not finite")
+    policy.set_training_mode(False)
+    return policy, config, record
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the ``run.json`` of a run folder.
+
+    :raises DamagedFileError: if it is missing (the run is unfinished) or no JSON object
+    """
+    path = folder / "run.json"
+    try:
+        record = json.loads(files.read_bytes(path, max_bytes=1 << 20))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise files.DamagedFileError(path, f"is no JSON: {error}") from error
+    if not isinstance(record, dict):
+        raise files.DamagedFileError(path, "is no JSON object")
+    return record
+
+
+def config_of(record: dict[str, Any]) -> Config:
+    """Return the configuration that a run was made with.
+
+    :raises DamagedFileError: if it is no valid configuration
+    """
+    try:
+        return Config.from_dict(record["config"])
+    except ValueError as error:
+        raise files.DamagedFileError("run.json", f"config: {error}") from error

@@ -1,0 +1,204 @@
+"""What happens beside a training: logs, the learning curve, the progress bar, checkpoints, and the end of it."""
+
+import csv
+import io
+import math
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from tqdm import tqdm
+
+from marl_encircle import files
+from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.maddpg import MADDPG
+
+
+class Stopped(Exception):  # noqa: N818 - nothing is wrong
+    """The training was asked to stop, and can go on from its checkpoint.
+
+    :param signum: by which signal
+    """
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signum).name}; the same command goes on from here")
+        self.signum = signum
+
+
+class Diverged(Exception):  # noqa: N818 - a result, not a fault of the program
+    """A loss is no finite number any more."""
+
+
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM instead of dying of the first; a second one ends the process as usual."""
+    caught: list[int] = []
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def catch(number: int, _frame: FrameType | None) -> None:
+        caught.append(number)
+        for each, handler in former.items():
+            signal.signal(each, handler)
+
+    for number in former:
+        signal.signal(number, catch)
+    try:
+        yield caught
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def ended_rounds(callback: BaseCallback, curriculum: CurriculumVecEnv) -> list[dict[str, Any]]:
+    """Return the info of one slot of each world whose round ended in this step."""
+    n = curriculum.n_agents
+    return [callback.locals["infos"][world * n] for world in np.flatnonzero(callback.locals["dones"][::n])]
+
+
+class RoundLogger(BaseCallback):
+    """Log the means of the figures of the rounds that ended since the last dump."""
+
+    def __init__(self, curriculum: CurriculumVecEnv) -> None:
+        super().__init__()
+        self.curriculum = curriculum
+        self._started = self._update_started = time.perf_counter()
+        self._world_steps = 0
+
+    def _on_training_start(self) -> None:
+        self._started, self._world_steps = time.perf_counter(), self.curriculum.world_steps
+
+    def _on_rollout_start(self) -> None:
+        self.logger.record_mean("time/update_ms", 1000 * (time.perf_counter() - self._update_started))
+
+    def _on_rollout_end(self) -> None:
+        self._update_started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        for info in ended_rounds(self, self.curriculum):
+            for name, value in info["round"].items():
+                self.logger.record_mean(name if "/" in name else f"rounds/{name}", value)
+        for name, value in self.curriculum.difficulty.items():
+            self.logger.record(f"curriculum/{name}", value)
+        elapsed = time.perf_counter() - self._started
+        self.logger.record("time/world_steps", self.curriculum.world_steps)
+        self.logger.record(
+            "time/world_steps_per_second", (self.curriculum.world_steps - self._world_steps) / max(elapsed, 1e-9)
+        )
+        return True
+
+
+class LearningCurve(BaseCallback):
+    """Play the selection rounds now and then and keep ``progress.csv``.
+
+    :param config: of the run
+    :param path: of the file
+    :param rows: of an earlier part of the training
+    """
+
+    COLUMNS = ("world_steps", "success", "mean_episode_length", "success_all", "success_pursuers", "sigma_c")
+    model: MADDPG
+
+    def __init__(
+        self, config: Config, curriculum: CurriculumVecEnv, path: Path, rows: list[list[float | None]]
+    ) -> None:
+        super().__init__()
+        self.config, self.curriculum, self.path, self.rows = config, curriculum, path, rows
+
+    def _on_rollout_start(self) -> None:
+        due = (len(self.rows) + 1) * self.config.training.curve_every
+        if self.curriculum.world_steps >= due:
+            self.add_point()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def add_point(self) -> None:
+        """Evaluate the present policy and write the curve so far."""
+        e = self.config.evaluation
+        episodes = play_rounds(self.model.policy, self.config, e.curve_episodes, e.curve_seed)
+        own = summarise_run(episodes, self.config.reward.closure)
+        rates = [summarise_run(episodes, rule).success for rule in ("all", "pursuers")]
+        row = [self.curriculum.world_steps, own.success, own.mean_episode_length, *rates, own.sigma_c]
+        self.rows.append(row)
+        for name, value in zip(self.COLUMNS[1:], row[1:], strict=True):
+            if value is not None:
+                self.logger.record(f"eval/{name}", value)
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.COLUMNS)
+        writer.writerows(["" if value is None else value for value in line] for line in self.rows)
+        files.write_text(self.path, text.getvalue())
+
+
+class Checkpointer(BaseCallback):
+    """Save everything from time to time and when a signal asks to stop; between two steps, where nothing is under way.
+
+    :param save: writes the checkpoint
+    :param every: seconds between checkpoints
+    :param caught: signals so far, see :func:`stop_signals`
+    """
+
+    def __init__(self, save: Callable[[], None], every: float, caught: list[int]) -> None:
+        super().__init__()
+        self.save, self.every, self.caught = save, every, caught
+        self._last = time.monotonic()
+
+    def _on_rollout_start(self) -> None:
+        if self.caught or time.monotonic() - self._last >= self.every:
+            self.save()
+            self._last = time.monotonic()
+        if self.caught:
+            raise Stopped(self.caught[0])
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class DivergenceGuard(BaseCallback):
+    """End the training when a loss is no finite number any more."""
+
+    def _on_rollout_start(self) -> None:
+        for name in ("train/critic_loss", "train/actor_loss"):
+            value = self.logger.name_to_value.get(name, 0.0)
+            if not math.isfinite(value):
+                raise Diverged(f"{name} is {value}")
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class ProgressBar(BaseCallback):
+    """World steps done and left, and the success rate of the latest rounds.
+
+    :param total: world steps of the whole training
+    """
+
+    def __init__(self, curriculum: CurriculumVecEnv, total: int) -> None:
+        super().__init__()
+        self.curriculum, self.total = curriculum, total
+        self.latest: deque[bool] = deque(maxlen=200)
+
+    def _on_training_start(self) -> None:
+        self.bar: Any = tqdm(total=self.total, initial=self.curriculum.world_steps, unit="world steps")
+
+    def _on_step(self) -> bool:
+        self.latest.extend(info["is_success"] for info in ended_rounds(self, self.curriculum))
+        self.bar.update(self.curriculum.world_steps - self.bar.n)
+        if self.latest:
+            self.bar.set_postfix(success=f"{np.mean(self.latest):.0%}", refresh=False)
+        return True
+
+    def close(self) -> None:
+        """Leave the terminal as it was, however the training ended."""
+        if hasattr(self, "bar"):
+            self.bar.close()

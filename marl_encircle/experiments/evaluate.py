@@ -1,0 +1,75 @@
+"""Policy and scenario -> evaluation rounds."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from marl_encircle.core.observations import layout, observe
+from marl_encircle.core.rewards import Reward, Transition
+from marl_encircle.core.rounds import NEVER, Rounds
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.simulator import Simulator, world_seeds
+from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.records import Episode
+from marl_encircle.maddpg.policies import MADDPGPolicy
+
+WORLDS_AT_ONCE = 100
+"""Always so many, the last ones for nothing if need be: the rounding of matrix products depends on the batch size."""
+
+
+def play_rounds(policy: MADDPGPolicy, config: Config, episodes: int, seed: int) -> list[Episode]:
+    """Play each round once, in a world of its own, with noise off and the scenario at its final difficulty.
+
+    Round r of evaluation seed s starts from the same placement for every method. It is played until both closure rules
+    have held or time is up, so that it does not matter which of them ends the method's training rounds.
+
+    :param episodes: number of rounds
+    :param seed: evaluation seed; world r is seeded with ``world_seeds(seed, episodes)[r]``
+    """
+    scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
+    reward = config.reward.build()
+    rounds: list[Episode] = []
+    seeds = world_seeds(seed, -(-episodes // WORLDS_AT_ONCE) * WORLDS_AT_ONCE)
+    for start in range(0, len(seeds), WORLDS_AT_ONCE):
+        rounds += _play(policy, scenario, reward, seeds[start : start + WORLDS_AT_ONCE], start)
+    return rounds[:episodes]
+
+
+def _play(
+    policy: MADDPGPolicy, scenario: Scenario, reward: Reward, seeds: Sequence[int], first_round: int
+) -> list[Episode]:
+    n_worlds, n = len(seeds), scenario.pursuers
+    simulator = Simulator(scenario, n_worlds)
+    simulator.seed(seeds)
+    simulator.reset()
+    rounds = Rounds(scenario, reward.closure, n_worlds)
+    observations = np.empty((n_worlds, n, list(layout(scenario).values())[-1].stop), np.float32)
+    for _ in range(scenario.max_cycles):
+        observe(simulator, observations)
+        slots, _ = policy.predict(observations.reshape(n_worlds * n, -1), deterministic=True)
+        actions = np.asarray(slots).reshape(n_worlds, n, 2)
+        measure = simulator.step(actions)
+        transition = Transition(scenario, simulator.state, actions, measure, simulator.former_measure, reward.closure)
+        rounds.add(simulator.steps, measure, reward.parts(transition))
+    steps = np.stack(list(rounds.success_step.values()))
+    length = np.where((steps != NEVER).all(axis=0), steps.max(axis=0), scenario.max_cycles)
+    sigma_c = rounds.contribution_spread
+    return [
+        Episode(
+            round=first_round + b,
+            seed=seeds[b],
+            step_all=_step(rounds.success_step["all"][b]),
+            step_pursuers=_step(rounds.success_step["pursuers"][b]),
+            length=int(length[b]),
+            return_mean=float(rounds.returns[b].mean()),
+            sigma_c=float(sigma_c[b]),
+            contacts_pursuers=int(rounds.contacts_pursuers[b]),
+            contacts_obstacles=int(rounds.contacts_obstacles[b]),
+        )
+        for b in range(n_worlds)
+    ]
+
+
+def _step(step: np.int64) -> int | None:
+    return None if step == NEVER else int(step)

@@ -1,0 +1,77 @@
+"""The whole road for a grid: train what is missing, evaluate what is missing, render the tables."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from marl_encircle import files
+from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.grid import Grid, load_grid
+from marl_encircle.experiments.records import read_runs
+from marl_encircle.experiments.sweep import Progress, sweep
+from marl_encircle.experiments.tables import MethodOptions, render_table1, render_tables
+from marl_encircle.experiments.train import run_folder, write_episodes
+
+TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
+
+
+class Reproduction(NamedTuple):
+    """What had to be done, in runs."""
+
+    trained: int
+    evaluated: int
+    reused: int
+    sweep: Progress
+
+
+def reproduce(
+    grid_name: str, results: str | Path, n_workers: int, report: Callable[[Progress], None] | None = None
+) -> Reproduction:
+    """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
+
+    :raises ConfigError: for a grid that is not allowed
+    :raises DamagedFileError: if a run there is not what its record says
+    """
+    grid = load_grid(grid_name)
+    runs = Path(results) / "runs"
+    progress = sweep(grid.jobs, runs, n_workers, report)
+    evaluated = 0
+    for job in grid.jobs:
+        folder = run_folder(job.config, job.seed, runs)
+        if (folder / "run.json").exists() and not (folder / "episodes.csv").exists():
+            policy, config, record = load_run(folder)
+            if record["status"] == "finished":
+                e = config.evaluation
+                write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed))
+                evaluated += 1
+    write_tables(grid, results)
+    trained = progress.done + progress.diverged - progress.reused
+    return Reproduction(trained, evaluated, progress.reused, progress)
+
+
+def write_tables(grid: Grid, results: str | Path) -> list[Path]:
+    """Render Tables 1-4 from the runs of a grid.
+
+    :return: the files written
+    """
+    asked = {(job.reward, job.setting, job.seed) for job in grid.jobs}
+    runs = [run for run in read_runs(Path(results) / "runs") if (run.cell.method, run.cell.setting, run.seed) in asked]
+    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS})
+    texts |= render_tables(runs, grid.aliases)
+    folder = Path(results) / "tables"
+    for name, text in texts.items():
+        files.write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def options_of(method: str) -> MethodOptions:
+    """Return the row of Table 1 that a method's reward configuration amounts to."""
+    reward = load_config(method).reward
+    active = reward.build().active
+    return MethodOptions(
+        two_stage=reward.two_stage,
+        obstacle_assisted=reward.closure == "all" and "obstacle_angle" in active,
+        individual_contributing_angle="contributing_angle" in active,
+    )

@@ -1,0 +1,235 @@
+"""One run: from a configuration and a seed to a run folder, resumable at any moment.
+
+A finished run folder holds ``run.json`` (written last: without it the run is unfinished), ``policy.safetensors`` (the
+actors), ``progress.csv`` (the learning curve) and ``episodes.csv`` (the evaluation rounds). Equal configuration, seed,
+machine and versions give equal files, save the times and versions in ``run.json``.
+"""
+
+import hashlib
+import os
+import platform
+import subprocess
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any, cast
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger, configure
+
+from marl_encircle import files
+from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments import checkpoint
+from marl_encircle.experiments.build import Engine, build_model, build_vec_env, policy_bytes, read_record
+from marl_encircle.experiments.callbacks import (
+    Checkpointer,
+    Diverged,
+    DivergenceGuard,
+    LearningCurve,
+    ProgressBar,
+    RoundLogger,
+    stop_signals,
+)
+from marl_encircle.experiments.config import PACKAGE, Config, difference
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.records import Episode, episodes_to_csv
+from marl_encircle.experiments.yaml_files import ConfigError
+
+SCHEMA = 1
+ROUNDS_PER_LOG = 500
+PACKAGES = ("numpy", "numba", "torch", "stable-baselines3", "gymnasium", "pettingzoo", "supersuit")
+
+
+class OtherRunError(ConfigError):
+    """The folder holds a run of another configuration."""
+
+
+def run_folder(config: Config, seed: int, out: str | Path) -> Path:
+    """Return ``OUT/<method>/ratio<lambda>_n<n>_m<m>_<scene>/seed<seed>``."""
+    return Path(out) / config.run_folder / f"seed{seed}"
+
+
+def train(
+    config: Config,
+    seed: int,
+    engine: Engine = "native",
+    out: str | Path = "results/runs",
+    *,
+    checkpoint_every: float = 120.0,
+    progress_bar: bool = False,
+    tensorboard: bool = False,
+) -> tuple[Path, bool]:
+    """Train, evaluate and record one run; go on where an interrupted one stopped.
+
+    The last policy is the result. Uses one thread.
+
+    :param out: folder of runs
+    :param checkpoint_every: seconds between checkpoints
+    :param tensorboard: write event files into the run folder
+    :return: the run folder, and whether anything was left to do
+    :raises OtherRunError: if the folder holds a run of another configuration or engine, with the difference
+    :raises Stopped: after SIGINT or SIGTERM, with a checkpoint written
+    """
+    folder = run_folder(config, seed, out)
+    if (folder / "run.json").exists():
+        check_same_run(folder, config, seed, engine)
+        return folder, False
+    plan = _plan(config, seed, engine)
+    with files.folder_lock(folder):
+        th.set_num_threads(1)
+        _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard)
+    return folder, True
+
+
+class _Run:
+    """The objects of one training and what they write."""
+
+    def __init__(self, config: Config, seed: int, engine: Engine, folder: Path, plan: dict[str, Any]) -> None:
+        self.config, self.folder, self.plan = config, folder, plan
+        self.wall_seconds = self.cpu_seconds = 0.0
+        self.rows: list[list[float | None]] = []
+        path = folder / checkpoint.NAME
+        saved = checkpoint.load_tree(path) if path.exists() else None
+        if saved is not None:
+            _check_same(folder, plan, saved["plan"])
+        self.env = build_vec_env(config, config.training.n_worlds, engine)
+        self.curriculum = cast(CurriculumVecEnv, self.env.venv)  # type: ignore[attr-defined]
+        self.model = build_model(config, self.env, seed)
+        if saved is not None:
+            checkpoint.restore(self.model, self.curriculum, saved["training"])
+            self.wall_seconds, self.cpu_seconds = saved["seconds"]
+            self.rows = saved["rows"]
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def play(self, checkpoint_every: float, progress_bar: bool, tensorboard: bool) -> None:
+        """Train to the end, then evaluate and record."""
+        model, curriculum, total = self.model, self.curriculum, self.config.training.world_steps
+        folder = self.folder / "tensorboard"
+        model.set_logger(configure(str(folder), ["tensorboard"]) if tensorboard else Logger(None, []))
+        curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows)
+        callbacks: list[BaseCallback] = [RoundLogger(curriculum), DivergenceGuard(), curve]
+        bar = ProgressBar(curriculum, total)
+        if progress_bar:
+            callbacks.append(bar)
+        status = "finished"
+        with stop_signals() as caught:
+            checkpointer = Checkpointer(self.save_checkpoint, checkpoint_every, caught)
+            try:
+                model.learn(
+                    (total - curriculum.world_steps) * self.config.scenario.pursuers,
+                    callback=CallbackList([*callbacks, checkpointer]),
+                    log_interval=ROUNDS_PER_LOG,
+                    reset_num_timesteps=not curriculum.world_steps,
+                )
+                curve.add_point()
+            except Diverged:
+                status = "diverged"
+            finally:
+                bar.close()
+        self.record(status)
+
+    def save_checkpoint(self) -> None:
+        """Write everything that the rest depends on."""
+        tree = {
+            "plan": self.plan,
+            "rows": self.rows,
+            "seconds": self.seconds(),
+            "training": checkpoint.capture(self.model, self.curriculum),
+        }
+        checkpoint.save_tree(self.folder / checkpoint.NAME, tree)
+
+    def seconds(self) -> tuple[float, float]:
+        """Wall-clock and processor seconds so far, those before a resume included."""
+        wall, cpu = time.monotonic() - self._wall, time.process_time() - self._cpu
+        return self.wall_seconds + wall, self.cpu_seconds + cpu
+
+    def record(self, status: str) -> None:
+        """Write the policy, its evaluation rounds and, last, the record of the run."""
+        wall, cpu = self.seconds()
+        contents = {"policy.safetensors": policy_bytes(self.model.policy)}
+        if status == "finished":
+            e = self.config.evaluation
+            episodes = play_rounds(self.model.policy, self.config, e.episodes, e.seed)
+            contents["episodes.csv"] = episodes_to_csv(episodes).encode()
+        for name, data in contents.items():
+            files.write_bytes(self.folder / name, data)
+        if (self.folder / "progress.csv").exists():
+            contents["progress.csv"] = (self.folder / "progress.csv").read_bytes()
+        record = {
+            "schema": SCHEMA,
+            "status": status,
+            "method": self.config.reward.name,
+            **self.plan,
+            "config_hash": self.config.hash,
+            "source_hash": source_hash(),
+            "git_commit": git_commit(),
+            "versions": versions(),
+            "cpu": cpu_model(),
+            "wall_seconds": round(wall, 3),
+            "cpu_seconds": round(cpu, 3),
+            "world_steps": self.curriculum.world_steps,
+            "updates": self.model._n_updates,
+            "sha256": {name: files.sha256_bytes(data) for name, data in sorted(contents.items())},
+        }
+        files.write_json(self.folder / "run.json", record)
+        (self.folder / checkpoint.NAME).unlink(missing_ok=True)
+
+
+def write_episodes(folder: Path, episodes: list[Episode]) -> None:
+    """Replace the evaluation rounds of a finished run and their hash in its record."""
+    data = episodes_to_csv(episodes).encode()
+    record = read_record(folder)
+    record["sha256"] = dict(sorted({**record["sha256"], "episodes.csv": files.sha256_bytes(data)}.items()))
+    files.write_bytes(folder / "episodes.csv", data)
+    files.write_json(folder / "run.json", record)
+
+
+def source_hash() -> str:
+    """sha256 over the package's Python and YAML files, in hexadecimal."""
+    digest = hashlib.sha256()
+    for path in sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.yaml")]):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout that the package runs from, ``-dirty`` if it has changes; else None."""
+    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that results depend on."""
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in PACKAGES}}
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or os.uname().machine
+
+
+def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:
+    """Raise an OtherRunError unless the finished run in ``folder`` is of this configuration, seed and engine."""
+    record, plan = read_record(folder), _plan(config, seed, engine)
+    _check_same(folder, plan, {key: record.get(key) for key in plan})
+
+
+def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:
+    return {"config": config.to_dict(), "seed": seed, "engine": engine}
+
+
+def _check_same(folder: Path, plan: dict[str, Any], other: dict[str, Any]) -> None:
+    lines = difference(plan, other)
+    if lines:
+        listing = "\n  ".join(lines)
+        raise OtherRunError(f"{folder} holds another run; give it another name or folder:\n  {listing}")

@@ -1,0 +1,118 @@
+"""YAML as this project reads it: plain data in one small file, everything else refused before it is parsed further.
+
+YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a key that comes twice is an error.
+"""
+
+import datetime
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    MappingEndEvent,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+)
+
+MAX_BYTES = 128_000
+MAX_DEPTH = 20
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message says where, what, and what is allowed."""
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a mapping from a YAML file.
+
+    :raises ConfigError: if there is no such file, it is larger than 128 kB, no YAML, no mapping, or has more in it than
+        mappings, lists, strings, finite numbers, booleans and null
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{path}: larger than {MAX_BYTES // 1000} kB")
+    try:
+        value = parse_yaml(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if not isinstance(value, dict):
+        raise ConfigError(f"{path}: must hold keys and values; got {value!r:.80}")
+    return value
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the plain data that a YAML text holds.
+
+    :raises ConfigError: see :func:`read_yaml`
+    """
+    yaml = YAML(typ="safe", pure=True)
+    try:
+        _refuse_tricks(yaml, text)
+        value = yaml.load(text)
+    except MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise ConfigError(f"{line}{error.problem or error.context}".splitlines()[0]) from error
+    except (YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"not YAML: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from error
+    _check_plain(value, "")
+    return value
+
+
+def _refuse_tricks(yaml: YAML, text: str) -> None:
+    """Walk over the events, which costs little, before anything is built."""
+    depth = 0
+    for event in yaml.parse(text):
+        where = f"line {event.start_mark.line + 1}"
+        if isinstance(event, AliasEvent) or getattr(event, "anchor", None):
+            raise ConfigError(f"{where}: anchors and aliases are not allowed; write the value out")
+        if isinstance(event, DocumentStartEvent) and (event.version or event.tags):
+            raise ConfigError(f"{where}: YAML directives are not allowed")
+        if isinstance(event, (ScalarEvent, MappingStartEvent, SequenceStartEvent)) and event.tag:
+            raise ConfigError(f"{where}: the tag {event.tag!s:.80} is not allowed; only plain values are")
+        if isinstance(event, ScalarEvent) and event.value == "<<" and event.style is None:
+            raise ConfigError(f"{where}: merge keys are not allowed; use 'base:'")
+        depth += isinstance(event, (MappingStartEvent, SequenceStartEvent))
+        depth -= isinstance(event, (MappingEndEvent, SequenceEndEvent))
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"{where}: nested more than {MAX_DEPTH} deep")
+
+
+def _check_plain(value: Any, path: str) -> None:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if not isinstance(key, str):
+                raise ConfigError(f"{path or 'top level'}: keys must be names; got {key!r:.80}")
+            _check_plain(inner, f"{path}.{key}" if path else key)
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            _check_plain(inner, f"{path}[{i}]")
+    elif isinstance(value, (datetime.date, datetime.datetime)):
+        raise ConfigError(f"{path}: {value} is read as a date; put it in quotes")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path}: must be finite; got {value}")
+    elif not isinstance(value, (str, int, float, bool, type(None))):
+        raise ConfigError(f"{path}: {value!r:.80} is no plain value")
+
+
+def merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the values of ``override``, mapping by mapping; null overrides too."""
+    merged = dict(base)
+    for key, value in override.items():
+        below = merged.get(key)
+        merged[key] = merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
