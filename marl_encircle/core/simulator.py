@@ -1,6 +1,7 @@
 """The simulator: B worlds side by side, each with its own stream of random numbers and its own difficulty."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
@@ -107,7 +108,14 @@ class Simulator:
         self._streams = [np.random.default_rng(s) for s in seeds]
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
-        """Change speed ratio, safety distance or obstacle radius from each world's next reset on."""
+        """Change speed ratio, safety distance or obstacle radius from each world's next reset on.
+
+        :raises ValueError: for another field, or a value that the scenario would not take
+        """
+        known = list(Difficulty.__annotations__)
+        if unknown := [name for name in difficulty if name not in known]:
+            raise ValueError(f"{unknown[0]:.80} is no difficulty; known: {', '.join(known)}")
+        replace(self.scenario, **difficulty)
         self._difficulty = {**self._difficulty, **difficulty}
 
     def reset(self, worlds: NDArray[np.int64] | None = None) -> Measure:

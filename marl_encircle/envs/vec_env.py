@@ -82,7 +82,8 @@ class EncirclementVecEnv(VecEnv):
         :param actions: one row a slot, in [-1, 1], (B * N, 2)
         :raises ValueError: for a wrong shape
         """
-        actions = np.asarray(actions)
+        with np.errstate(over="ignore"):  # too large for single precision is infinite, and told by name in step_wait
+            actions = np.array(actions, np.float32)
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), one row a slot; got {actions.shape}")
         self._actions = actions.reshape(self.n_worlds, self.n_agents, 2)
