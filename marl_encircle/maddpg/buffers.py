@@ -71,8 +71,9 @@ class JointReplayBuffer(ReplayBuffer):
         self.dones[self.pos] = done
         if self.handle_timeout_termination:
             self.timeouts[self.pos] = False
-            for slot in np.flatnonzero(done):
-                self.timeouts[self.pos, slot] = infos[slot].get("TimeLimit.truncated", False)
+            ended = np.flatnonzero(done)
+            truncated = [infos[slot].get("TimeLimit.truncated", False) for slot in ended]
+            self.timeouts[self.pos, ended] = np.reshape(truncated, len(ended))
 
         self.pos += 1
         if self.pos == self.buffer_size:

@@ -90,7 +90,7 @@ class MADDPG(OffPolicyAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,
-        learning_starts: int = 1024,
+        learning_starts: int = 100,
         batch_size: int = 1024,
         tau: float = 0.01,
         gamma: float = 0.95,
@@ -176,8 +176,7 @@ class MADDPG(OffPolicyAlgorithm):
             self.lr_schedule,
             n_agents=self.n_agents,
             critic=self.critic_kind,
-            n_critics=self.n_critics,
-            **self.policy_kwargs,
+            **{"n_critics": self.n_critics, **self.policy_kwargs},
         )
         self.policy = self.policy.to(self.device)
         self._create_aliases()

@@ -76,9 +76,10 @@ class StackedMLP(nn.Module):
         else:
             for weight, bias in layers:
                 hidden = self.activation(th.baddbmm(bias, hidden, weight))
-        hidden = hidden.reshape(-1, batch_size, hidden.shape[-1])
+        if len(head_weight) > 1:
+            hidden = hidden.reshape(-1, batch_size, hidden.shape[-1])
         products: th.Tensor = Heads.apply(hidden, head_weight)  # type: ignore[no-untyped-call]
-        return products + head_bias
+        return (products + head_bias).reshape(-1, batch_size, products.shape[-1])
 
 
 class ReLULayers(th.autograd.Function):

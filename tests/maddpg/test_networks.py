@@ -1,0 +1,76 @@
+import pytest
+import torch as th
+from torch import nn
+
+from marl_encircle.maddpg.networks import StackedMLP
+
+
+def plain_outputs(network: StackedMLP, x: th.Tensor) -> th.Tensor:
+    """One network after the other by ``nn.functional.linear``; ReLU after every layer but the last."""
+    outputs = []
+    for head in range(max(len(x), len(network.head_weight))):
+        hidden = x[min(head, len(x) - 1)]
+        for weight, bias in zip(network.weights, network.biases, strict=True):
+            n = min(head, network.n - 1)
+            hidden = nn.functional.linear(hidden, weight[n].T, bias[n, 0]).relu()
+        n = min(head, len(network.head_weight) - 1)
+        outputs.append(nn.functional.linear(hidden, network.head_weight[n].T, network.head_bias[n, 0]))
+    return th.stack(outputs)
+
+
+CASES = {
+    "a network per input": (3, 3, 3),
+    "networks with a common input": (3, 3, 1),
+    "one trunk, a head per agent, a common input": (1, 3, 1),
+    "one trunk, a head and an input per agent": (1, 3, 3),
+    "one network for all inputs": (1, 1, 3),
+    "one network": (1, 1, 1),
+}
+
+
+@pytest.mark.parametrize("output_dim", [1, 2])
+@pytest.mark.parametrize("net_arch", [[], [4], [4, 6]], ids=str)
+@pytest.mark.parametrize("case", CASES)
+def test_stacked_networks_equal_single_ones_in_values_and_gradients(
+    case: str, net_arch: list[int], output_dim: int
+) -> None:
+    n, n_heads, m = CASES[case]
+    th.manual_seed(0)
+    network = StackedMLP(n, 5, net_arch, output_dim, n_heads=n_heads).double()
+    x = th.randn(m, 7, 5, dtype=th.float64, requires_grad=True)
+    weights = th.randn(max(m, n_heads), 7, output_dim, dtype=th.float64)
+    inputs = [x, *network.parameters()]
+
+    outputs, expected = network(x), plain_outputs(network, x)
+    th.testing.assert_close(outputs, expected, rtol=1e-12, atol=1e-12)
+    with th.no_grad():
+        th.testing.assert_close(network(x), expected, rtol=1e-12, atol=1e-12)
+    grads = th.autograd.grad((outputs * weights).sum(), inputs)
+    expected_grads = th.autograd.grad((expected * weights).sum(), inputs)
+    th.testing.assert_close(grads, expected_grads, rtol=1e-12, atol=1e-12)
+
+
+def test_other_activations_are_left_to_autograd() -> None:
+    network = StackedMLP(2, 5, [4], 1, nn.Tanh).double()
+    x = th.randn(2, 7, 5, dtype=th.float64, requires_grad=True)
+    assert th.autograd.gradcheck(network, x)
+    by_hand = th.tanh(x @ network.weights[0] + network.biases[0]) @ network.head_weight + network.head_bias
+    th.testing.assert_close(network(x), by_hand)
+
+
+def test_constant_networks_pass_gradients_to_the_input_only() -> None:
+    network = StackedMLP(2, 5, [4, 4], 1)
+    x = th.randn(2, 7, 5, requires_grad=True)
+    network(x, constant=True).sum().backward()
+    assert x.grad is not None
+    assert x.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+def test_weights_start_like_those_of_linear_layers() -> None:
+    th.manual_seed(0)
+    network = StackedMLP(3, 100, [400], 100)
+    # nn.Linear: uniform in +-1/sqrt(fan_in), for weights and biases
+    for parameter, fan_in in [(network.weights[0], 100), (network.biases[0], 100), (network.head_weight, 400)]:
+        assert parameter.abs().max().item() == pytest.approx(fan_in**-0.5, rel=0.01)
+        assert parameter.mean().item() == pytest.approx(0, abs=0.05 * fan_in**-0.5)
