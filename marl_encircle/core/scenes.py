@@ -80,14 +80,16 @@ def place(
             cos = np.cos(2 * np.pi * u[at + 2])
             sin = np.sin(2 * np.pi * u[at + 2])
             at += 3
-            fits = True
+            fits = False
             for k in range(length):
                 disc = discs[b, m * length + k]
                 disc[0] = x + obstacle_radius[b] * (cos * shape[k, 0] - sin * shape[k, 1])
                 disc[1] = y + obstacle_radius[b] * (sin * shape[k, 0] + cos * shape[k, 1])
                 disc[2] = obstacle_radius[b] * shape[k, 2]
-                fits &= abs(disc[0]) <= reach and abs(disc[1]) <= reach
-                fits &= not separated or _is_free(disc[0], disc[1], disc[2], discs[b, : m * length])
+                fits = abs(disc[0]) <= reach and abs(disc[1]) <= reach
+                fits = fits and (not separated or _is_free(disc[0], disc[1], disc[2], discs[b, : m * length]))
+                if not fits:
+                    break
             if fits:
                 centres[b, m, 0] = x
                 centres[b, m, 1] = y
@@ -115,7 +117,8 @@ def place(
 
 @kernel
 def _is_free(x: float, y: float, radius: float, discs: Array) -> bool:
-    free = True
     for d in range(len(discs)):
-        free &= np.hypot(x - discs[d, 0], y - discs[d, 1]) >= radius + discs[d, 2]
-    return free
+        dx, dy, reach = x - discs[d, 0], y - discs[d, 1], radius + discs[d, 2]
+        if dx * dx + dy * dy < reach * reach:
+            return False
+    return True

@@ -202,36 +202,39 @@ class Simulator:
         )
 
     def _place(self, worlds: NDArray[np.int64]) -> None:
+        scenario = self.scenario
+        # After the first draw worlds go on one by one, so that an impossible scene costs the tries of one world only.
+        for b in self._draw(worlds, 0):
+            if all(len(self._draw(np.array([b]), attempt)) for attempt in range(1, PLACEMENT_DRAWS)):
+                raise PlacementError(
+                    f"{scenario.obstacles} obstacles of radius {self.state.obstacle_radius[b]:g}, the target and "
+                    f"{scenario.pursuers} pursuers could not be placed without overlap in {PLACEMENT_DRAWS} tries; "
+                    "use fewer or smaller bodies, or placement='overlapping'"
+                )
+
+    def _draw(self, worlds: NDArray[np.int64], attempt: int) -> NDArray[np.int64]:
+        """Place worlds anew and return those in which something did not fit."""
         scenario, s = self.scenario, self.state
         uniforms_needed = 3 * scenario.obstacles + 2 * (scenario.pursuers + 1)
-        waiting = worlds
-        for attempt in range(PLACEMENT_DRAWS):
-            uniforms = np.empty((len(waiting), min(8 * uniforms_needed << attempt, MAX_UNIFORMS)))
-            for row, b in zip(uniforms, waiting, strict=True):
-                self._streams[b].random(out=row)
-            placed = scenes.place(
-                waiting,
-                uniforms,
-                self._shape,
-                s.obstacle_radius,
-                scenario.pursuer_radius,
-                scenario.target_radius,
-                scenario.half_width,
-                scenario.obstacle_limit,
-                scenario.placement == "separated",
-                s.pursuers,
-                s.target,
-                s.discs,
-                s.obstacles,
-            )
-            waiting = waiting[~placed]
-            if not len(waiting):
-                return
-        raise PlacementError(
-            f"{scenario.obstacles} obstacles of radius {s.obstacle_radius[waiting[0]]:g}, the target and "
-            f"{scenario.pursuers} pursuers could not be placed without overlap in {PLACEMENT_DRAWS} tries; "
-            "use fewer or smaller bodies, or placement='overlapping'"
+        uniforms = np.empty((len(worlds), min(8 * uniforms_needed << attempt, MAX_UNIFORMS)))
+        for row, b in zip(uniforms, worlds, strict=True):
+            self._streams[b].random(out=row)
+        placed = scenes.place(
+            worlds,
+            uniforms,
+            self._shape,
+            s.obstacle_radius,
+            scenario.pursuer_radius,
+            scenario.target_radius,
+            scenario.half_width,
+            scenario.obstacle_limit,
+            scenario.placement == "separated",
+            s.pursuers,
+            s.target,
+            s.discs,
+            s.obstacles,
         )
+        return worlds[~placed]
 
 
 class _MeasureBuffers:
