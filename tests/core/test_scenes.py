@@ -1,0 +1,161 @@
+"""Placement: what a scene promises whatever the seed, and an end in bounded time."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from marl_encircle.core import scenes
+from marl_encircle.core.geometry import NOBODY
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.scenes import SCENES
+from marl_encircle.core.simulator import PlacementError, Simulator
+
+SEEDS = 1000 if os.environ.get("HYPOTHESIS_PROFILE") == "thorough" else 100
+SHAPES = {
+    "random": Scenario(obstacles=3),
+    "concave": Scenario(scene="concave", obstacles=2, obstacle_radius=0.15),
+    "tunnel": Scenario(scene="tunnel", obstacles=2, obstacle_radius=0.15),
+    "ten": Scenario(pursuers=10, obstacles=5),
+    "none": Scenario(pursuers=1, obstacles=0),
+}
+
+
+def drawn(scenario: Scenario, n_worlds: int = 200, seed: int = 5) -> Simulator:
+    sim = Simulator(scenario, n_worlds, seed)
+    sim.reset()
+    return sim
+
+
+def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(a[:, :, None, :2] - b[:, None, :, :2], axis=3)
+
+
+def test_the_registry_is_what_the_file_defines() -> None:
+    defined = {
+        name: f
+        for name, f in vars(scenes).items()
+        if getattr(f, "__module__", None) == scenes.__name__ and not name.startswith("_") and name != "place"
+    }
+    assert defined == SCENES
+
+
+@pytest.mark.parametrize("scenario", SHAPES.values(), ids=SHAPES)
+def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
+    s = drawn(scenario).state
+    n, length = scenario.pursuers, scenario.discs // max(scenario.obstacles, 1)
+    assert (distances(s.pursuers, s.pursuers)[:, ~np.eye(n, dtype=bool)] >= 2 * scenario.pursuer_radius).all()
+    target = s.target[:, None]
+    assert (distances(s.pursuers, target) >= scenario.pursuer_radius + scenario.target_radius).all()
+    for bodies, radius in ((s.pursuers, scenario.pursuer_radius), (target, scenario.target_radius)):
+        assert (distances(bodies, s.discs) >= radius + s.discs[:, None, :, 2]).all()
+    unit = np.arange(scenario.discs) // max(length, 1)
+    others = unit[:, None] != unit
+    reach = s.discs[:, :, None, 2] + s.discs[:, None, :, 2]
+    assert (distances(s.discs, s.discs)[:, others] >= reach[:, others]).all()
+
+
+@pytest.mark.parametrize("scenario", SHAPES.values(), ids=SHAPES)
+def test_everything_starts_within_the_limits_and_at_rest(scenario: Scenario) -> None:
+    s = drawn(scenario).state
+    assert (np.abs(s.pursuers) <= 1.0).all()
+    assert (np.abs(s.target) <= 1.0).all()
+    assert (np.abs(s.discs[..., :2]) <= 0.9).all()
+    assert (s.velocities == 0).all()
+    assert not np.shares_memory(s.obstacles, s.discs)
+
+
+def test_positions_are_uniform_over_the_scene() -> None:
+    s = drawn(Scenario(obstacles=2, placement="overlapping", half_width=2.0), 4000).state
+    for points, width in ((s.pursuers[:, 0], 2.0), (s.target, 2.0), (s.obstacles[:, 1], 1.8)):
+        # Uniform on [-w, w]: mean 0, mean square w^2 / 3, standard errors of 4,000 are w / 110 and w^2 / 212
+        np.testing.assert_allclose(points.mean(axis=0), 0, atol=width / 110 * 4)
+        np.testing.assert_allclose((points**2).mean(axis=0), width**2 / 3, atol=width**2 / 212 * 4)
+        np.testing.assert_allclose((points[:, 0] * points[:, 1]).mean(), 0, atol=width**2 / 190 * 4)
+
+
+def test_overlapping_placement_takes_every_draw() -> None:
+    s = drawn(Scenario(obstacles=3, placement="overlapping"), 500).state
+    assert (distances(s.pursuers, s.target[:, None]) < 0.1).any()
+    assert (distances(s.discs, s.discs)[:, ~np.eye(3, dtype=bool)] < 0.4).any()
+
+
+def test_a_seed_draws_the_same_scene_again_and_another_seed_another_one() -> None:
+    first, again, other = (drawn(SHAPES["tunnel"], 8, seed).state for seed in (5, 5, 6))
+    for name in first._fields:
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    assert (first.target != other.target).any(axis=1).all()
+    assert len(np.unique(first.target, axis=0)) == 8
+
+
+@pytest.mark.parametrize("scene", ["concave", "tunnel"])
+def test_a_composite_obstacle_is_rigid_and_scales_with_the_radius(scene: str) -> None:
+    scenario = SHAPES[scene]
+    shape = SCENES[scene]()
+    s = drawn(scenario, 50).state
+    expected = np.linalg.norm(shape[:, None, :2] - shape[None, :, :2], axis=2) * 0.15
+    for unit in range(2):
+        part = s.discs[:, unit * len(shape) : (unit + 1) * len(shape)]
+        np.testing.assert_allclose(distances(part, part), np.broadcast_to(expected, (50, *expected.shape)), atol=1e-12)
+        np.testing.assert_allclose(part[..., :2].mean(axis=1), s.obstacles[:, unit], atol=1e-12)
+        np.testing.assert_allclose(part[..., 2], np.broadcast_to(shape[:, 2] * 0.15, part.shape[:2]))
+    first = s.discs[:, 0, :2] - s.obstacles[:, 0]
+    quadrant = np.floor(np.arctan2(first[:, 1], first[:, 0]) / (np.pi / 2))
+    assert len(np.unique(quadrant)) == 4, "at any angle"
+
+
+@pytest.mark.parametrize(("scene", "gaps"), [("concave", 1), ("tunnel", 2)])
+def test_from_inside_a_concave_obstacle_is_open_to_one_side_and_a_tunnel_at_both_ends(scene: str, gaps: int) -> None:
+    scenario = Scenario(pursuers=1, scene=scene, speed_ratio=100.0, n_directions=720, contacts="off")
+    sim = drawn(scenario, 1)
+    saved = sim.get_state()
+    s = saved["state"]
+    s["target"][0] = s["obstacles"][0, 0]
+    if scene == "concave":  # its centre of mass lies near the arc; the middle of the half circle is what it encloses
+        ends = s["discs"][0, [0, -1], :2]
+        s["target"][0] = ends.mean(axis=0)
+    s["pursuers"][0, 0] = s["target"][0] + 1e-3
+    s["pursuers"][0, 0] = 50.0  # blocks next to nothing at this ratio
+    sim.set_state(saved)
+    owner = sim.measure.enclosure["all"].owner[0]
+    is_open = (owner != 1).astype(int)
+    assert (np.diff(is_open, append=is_open[0]) == 1).sum() == gaps
+    free = is_open.mean()
+    # Concave: half the circle less what the discs at the ends, 0.4 R + r_T = 0.13 at 0.3, add: 2 x 25.7 degrees
+    # Tunnel: between walls at 1.25 R = 0.25 that reach 0.3 + ... ahead; see the discs at the ends
+    assert 0.05 < free < 0.4
+    # The target's body fits inside
+    assert (np.linalg.norm(s["discs"][0, :, :2] - s["target"][0], axis=1) > s["discs"][0, :, 2] + 0.05).all()
+    assert (owner != NOBODY).any()
+
+
+def test_nearly_half_cover_can_be_placed_whatever_the_seed() -> None:
+    # 14 x 0.04 + 4 x 0.0025 = 0.57 of 4 / pi: 44.8 %
+    scenario = Scenario(obstacles=14)
+    assert scenario.cover == pytest.approx(0.45, abs=0.005)
+    for seed in range(SEEDS):
+        drawn(scenario, 1, seed)
+    pursuers = Scenario(obstacles=0, pursuers=56)
+    pursuers = Scenario(obstacles=0, pursuers=56, pursuer_radius=0.1)
+    assert pursuers.cover == pytest.approx(0.44, abs=0.01)
+    drawn(pursuers, SEEDS, 0)
+
+
+INFEASIBLE = {
+    "two in one place": Scenario(obstacles=2, obstacle_limit=0.0),
+    "crowded": Scenario(obstacles=64, obstacle_radius=0.08, obstacle_limit=0.3),
+    "too long": Scenario(pursuers=1, scene="tunnel", obstacle_radius=0.6),
+    "many discs": Scenario(obstacles=64, scene="tunnel", obstacle_radius=0.06),
+}
+
+
+@pytest.mark.parametrize("n_worlds", [1, 256])
+@pytest.mark.parametrize("scenario", INFEASIBLE.values(), ids=INFEASIBLE)
+def test_an_infeasible_scene_is_a_clear_error_within_a_second(scenario: Scenario, n_worlds: int) -> None:
+    sim = Simulator(scenario, n_worlds, 0)
+    drawn(Scenario(), 1)  # compiled by now
+    start = time.perf_counter()
+    with pytest.raises(PlacementError, match=f"{scenario.obstacles} obstacles .* could not be placed"):
+        sim.reset()
+    assert time.perf_counter() - start < 1.0
