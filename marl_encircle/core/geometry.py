@@ -61,6 +61,10 @@ class Enclosure(NamedTuple):
         """Whether every sampled direction has a contributor, (B,)."""
         return np.isfinite(self.movement_range)
 
+    def occupies(self, share: float) -> NDArray[np.bool_]:
+        """Whether at least this share of the circle is occupied, rounding aside, (B,)."""
+        return self.occupied_angle >= 2 * np.pi * share - 1e-9
+
 
 class Measure(NamedTuple):
     """Everything that rewards, metrics and drawings know of a state."""

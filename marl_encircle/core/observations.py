@@ -50,10 +50,10 @@ def observe(simulator: Simulator, out: NDArray[np.float32], worlds: NDArray[np.i
     _observe(worlds, state.pursuers, state.velocities, state.target, things, softening, out)
     if not scenario.observe_extras:
         return
-    share = simulator.measure.enclosure["all"].occupied_angle / (2 * np.pi)
+    enclosure = simulator.measure.enclosure["all"]
     extras = {
-        "occupied_angle": share,
-        "stage": share >= scenario.stage_threshold,
+        "occupied_angle": enclosure.occupied_angle / (2 * np.pi),
+        "stage": enclosure.occupies(scenario.stage_threshold),
         "speed_ratio": state.speed_ratio,
     }
     for name in scenario.observe_extras:

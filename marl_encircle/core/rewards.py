@@ -200,7 +200,7 @@ class Reward:
         """Return each term's share of the reward, (B, N) each."""
         gate = None
         if self.two_stage:
-            gate = (t.enclosure.occupied_angle >= t.scenario.stage_threshold * CIRCLE)[:, None]
+            gate = t.enclosure.occupies(t.scenario.stage_threshold)[:, None]
         shares = {}
         for name, (weight, parameters) in self.active.items():
             share = (self.scale * weight) * TERMS[name](t, **parameters)
