@@ -44,10 +44,10 @@ def arranged_as(layout: Layout, n_directions: int = 72, at: Sequence[float] = (0
 
 
 def push(sim: Simulator, *actions: Sequence[float]) -> Simulator:
-    """One step in which pursuer i does ``actions[i]``; the last one also stands for all later pursuers."""
+    """One step in which pursuer i of each world does ``actions[i]``; the last one stands for later ones too."""
     n = sim.scenario.pursuers
     rows = [*actions, *[actions[-1]] * (n - len(actions))] if actions else [(0.0, 0.0)] * n
-    sim.step(np.array([rows], dtype=float))
+    sim.step(np.array([rows] * sim.n_worlds, dtype=float))
     return sim
 
 
