@@ -76,6 +76,7 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
     :param scenario: the rules
     :param reward: the reward, and the closure rule that ends a round
     :param render_mode: None, ``human`` or ``rgb_array``
+    :raises ImportError: if something is to be drawn and pygame-ce is missing
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -89,8 +90,12 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ValueError(f"render_mode must be None or one of {', '.join(modes)}; got {render_mode!r:.80}")
+        if render_mode is not None:
+            _load_renderer()  # so that a missing pygame-ce is told here, not at the first picture
         self.scenario, self.reward = scenario, reward
         self.render_mode = render_mode
+        self._trail: list[NDArray[np.float64]] = []
+        self._window: Any = None
         self.possible_agents = list(scenario.agents)
         self.agents: list[str] = []
         self._arena = Arena(scenario, reward, n_worlds=1)
@@ -133,8 +138,9 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             self._arena.simulator.seed([seed])
         observations = self._arena.reset()
         self.agents = self.possible_agents[:]
-        if self.render_mode == "human":
-            self.render()
+        self._trail.clear()
+        if self.render_mode is not None:
+            self._show()
         return dict(zip(self.agents, observations[0], strict=True)), {
             agent: {"is_success": False} for agent in self.agents
         }
@@ -160,8 +166,8 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             for info in infos.values():
                 info["round"] = figures
             self.agents = []
-        if self.render_mode == "human":
-            self.render()
+        if self.render_mode is not None:
+            self._show()
         return (
             dict(zip(agents, outcome.observations[0], strict=True)),
             dict(zip(agents, outcome.rewards[0].tolist(), strict=True)),
@@ -184,13 +190,33 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         """Draw the world.
 
         :return: the picture (H, W, 3) if the render mode is ``rgb_array``, else None
+        :raises RuntimeError: if a window is wanted and there is no display
         """
         if self.render_mode is None:
             gymnasium.logger.warn("render() draws nothing: give render_mode='human' or 'rgb_array' to parallel_env")
+            return None
+        renderer = _load_renderer()
+        view = renderer.view(self._arena.simulator, self.reward.closure, self._trail)
+        if self.render_mode == "rgb_array":
+            picture: NDArray[np.uint8] = renderer.picture(view)
+            return picture
+        if self._window is None:
+            self._window = renderer.Window(self.metadata["name"], self.metadata["render_fps"])
+        self._window.show(view)
         return None
 
     def close(self) -> None:
         """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _show(self) -> None:
+        """Remember where everybody is, and keep the window, if there is one, up to date."""
+        state = self._arena.simulator.state
+        self._trail.append(np.concatenate([state.pursuers[0], state.target]))
+        if self.render_mode == "human":
+            self.render()
 
     def _joint(self, actions: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the actions of all agents, (1, N, 2), or raise a ValueError that names who is wrong."""
@@ -229,3 +255,10 @@ def _state_space(scenario: Scenario) -> Box:
     # As in the observation's bounds, one part in a million covers the rounding to single precision.
     high = (width * (1 + 1e-6)).astype(np.float32)
     return Box(-high, high)
+
+
+def _load_renderer() -> Any:
+    """Import the drawing, and with it pygame-ce, only once somebody wants to see something."""
+    from marl_encircle.envs import render
+
+    return render

@@ -1,7 +1,6 @@
 """The PettingZoo environment: PettingZoo's own tests, the checks that these leave out, and every error's words."""
 
 import pickle
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +8,7 @@ import faulty_worlds
 import numpy as np
 import pettingzoo
 import pytest
+from pettingzoo_tests import api_test, max_cycles_test, parallel_api_test, parallel_seed_test, state_test
 from world_checks import check_worlds, fingerprint, fingerprints_elsewhere, random_actions
 
 import marl_encircle
@@ -17,12 +17,6 @@ from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.encirclement_v0 import parallel_env
-
-with warnings.catch_warnings():
-    # pettingzoo.test makes an environment of its own in the way that PettingZoo 1.27 deprecates.
-    warnings.simplefilter("ignore", DeprecationWarning)
-    from pettingzoo.test import api_test, max_cycles_test, parallel_api_test, parallel_seed_test
-    from pettingzoo.test.state_test import state_test
 
 ID = "marl_encircle/encirclement-v0"
 
