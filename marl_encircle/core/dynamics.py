@@ -53,7 +53,9 @@ def physics_of(scenario: Scenario) -> Constants:
         "from_surface": scenario.repulsion_from == "surface",
         "relaxed_path": scenario.path_rule == "relaxed",
     }
-    return np.array([tuple(values.values())], dtype=[(name, type(value)) for name, value in values.items()])
+    fields = [(name, type(value)) for name, value in values.items()]
+    # A record rather than a void, so that plain Python (NUMBA_DISABLE_JIT) reads fields by name too.
+    return np.array([tuple(values.values())], dtype=(np.record, fields))
 
 
 @kernel

@@ -1,6 +1,7 @@
 """The scenario: everything about the world that the paper leaves open or varies, with default, unit and symbol."""
 
 import math
+import sys
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -110,6 +111,8 @@ class Scenario:
         hints = get_type_hints(type(self))
         for f in fields(self):
             _check(f.name, getattr(self, f.name), hints[f.name], f.metadata)
+            if hints[f.name] is float:  # 1 and 1.0 are one scenario, and one compilation
+                object.__setattr__(self, f.name, float(getattr(self, f.name)))
         if self.n_directions % 2:
             raise ValueError(f"n_directions must be even (each direction has its opposite); got {self.n_directions}")
         if self.scene not in SCENES:
@@ -158,7 +161,7 @@ def _check(name: str, value: object, hint: Any, metadata: Any) -> None:
         if isinstance(value, bool) or not isinstance(value, kinds):
             raise ValueError(f"{name} must be {'an integer' if hint is int else 'a number'}; got {value!r:.80}")
         low, high = metadata["low"], metadata["high"]
-        if not (math.isfinite(value) and low <= value <= high):
+        if not low <= value <= min(high, sys.float_info.max):
             allowed = f"between {low:g} and {high:g}" if high < math.inf else f"a finite number of at least {low:g}"
             raise ValueError(f"{name} must be {allowed}; got {value!r:.80}")
     elif get_origin(hint) is tuple:
