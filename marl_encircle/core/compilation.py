@@ -60,7 +60,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     config.CACHE_DIR = str(_CACHE_FOLDER)
     try:
         compiled: Callable[P, R] = numba.njit(
-            cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "contract", "nsz"}
+            cache=True, error_model="numpy", nogil=True, forceinline=True, fastmath={"reassoc", "contract", "nsz"}
         )(function)
     finally:
         config.CACHE_DIR = theirs

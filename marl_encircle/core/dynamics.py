@@ -1,19 +1,20 @@
 """How pursuers and the target move in one step: MPE's physics, contacts, and the target's escape (Eq. 14, Sec. 5.1).
 
-Every kernel loops over worlds and reads like the physics of one of them. ``worlds`` may be any subset of the batch.
+Every kernel moves one world, b, of the batch in place and reads like its physics; the simulator loops over worlds.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle.core.compilation import kernel
-from marl_encircle.core.scenario import Scenario
+
+if TYPE_CHECKING:  # the scenario looks its target up here
+    from marl_encircle.core.scenario import Scenario
 
 Array = NDArray[np.float64]
-Worlds = NDArray[np.int64]
 Constants = NDArray[np.void]
 Physics = Any  # the one record of ``Constants``; its fields are the keys in ``physics_of``
 
@@ -24,7 +25,7 @@ PROJECTION_PASSES = 4
 """Gauss-Seidel passes of hard contacts."""
 
 
-def physics_of(scenario: Scenario) -> Constants:
+def physics_of(scenario: "Scenario") -> Constants:
     """Return the scenario's physics as an array of one record, whose scalars the kernels read by name."""
     values = {
         "half_width": scenario.half_width,
@@ -52,6 +53,8 @@ def physics_of(scenario: Scenario) -> Constants:
         "hard_contacts": scenario.contacts == "hard",
         "from_surface": scenario.repulsion_from == "surface",
         "relaxed_path": scenario.path_rule == "relaxed",
+        "target_sees_moves": scenario.turn_order == "pursuers_first",
+        "target": list(TARGETS).index(scenario.target),
     }
     fields = [(name, type(value)) for name, value in values.items()]
     # A record rather than a void, so that plain Python (NUMBA_DISABLE_JIT) reads fields by name too.
@@ -59,30 +62,21 @@ def physics_of(scenario: Scenario) -> Constants:
 
 
 @kernel
-def first_bad_action(actions: Array) -> int:
-    """Return the slot (world * N + pursuer) of the first action that is not finite, or -1."""
-    for b in range(actions.shape[0]):
-        for i in range(actions.shape[1]):
-            if not (np.isfinite(actions[b, i, 0]) and np.isfinite(actions[b, i, 1])):
-                return int(b * actions.shape[1] + i)
-    return -1
-
-
-@kernel
 def move_pursuers(
-    worlds: Worlds,
+    b: int,
     actions: Array,
     pursuers: Array,
     velocities: Array,
     target: Array,
     discs: Array,
-    constants: Constants,
+    physics: Physics,
+    moved: Array,
 ) -> None:
-    """Move all pursuers of ``worlds`` by one step, in place.
+    """Move all pursuers of world b by one step.
 
     MPE's second-order dynamics: v <- (1 - damping) v + (acceleration a + F / mass) dt, clipped to the limit, then
-    x <- x + v dt. ``mpe2`` moves with the old velocity. First order: v = v_P a + F dt / mass. Actions beyond [-1, 1] are
-    clipped. Soft contacts F push pursuers off each other, the target and the obstacles; the scene's edge stops the
+    x <- x + v dt. ``mpe2`` moves with the old velocity. First order: v = v_P a + F dt / mass. Actions beyond [-1, 1]
+    are clipped. Soft contacts F push pursuers off each other, the target and the obstacles; the scene's edge stops the
     velocity across it.
 
     :param actions: (B, N, 2) in [-1, 1]
@@ -90,42 +84,41 @@ def move_pursuers(
     :param velocities: [scene units per time unit], (B, N, 2)
     :param target: (B, 2)
     :param discs: x, y, radius of the obstacles' discs, (B, D, 3)
-    :param constants: see :func:`physics_of`
+    :param physics: see :func:`physics_of`
+    :param moved: scratch, (N, 2)
     """
-    physics = constants[0]
     n = pursuers.shape[1]
     dt = physics.time_step
-    moved = np.empty((n, 2))
-    for b in worlds:
-        for i in range(n):
-            fx, fy = 0.0, 0.0
-            if physics.soft_contacts:
-                fx, fy = _contact_force(b, i, pursuers, target, discs, physics)
-            ax = min(max(actions[b, i, 0], -1.0), 1.0)
-            ay = min(max(actions[b, i, 1], -1.0), 1.0)
-            old_vx, old_vy = velocities[b, i, 0], velocities[b, i, 1]
-            if physics.first_order:
-                vx = physics.max_speed * ax + fx / physics.mass * dt
-                vy = physics.max_speed * ay + fy / physics.mass * dt
-            else:
-                vx = (1 - physics.damping) * old_vx + (physics.acceleration * ax + fx / physics.mass) * dt
-                vy = (1 - physics.damping) * old_vy + (physics.acceleration * ay + fy / physics.mass) * dt
-            speed = np.sqrt(vx * vx + vy * vy)
-            if speed > physics.max_speed:
-                vx *= physics.max_speed / speed
-                vy *= physics.max_speed / speed
-            velocities[b, i, 0] = vx
-            velocities[b, i, 1] = vy
-            moved[i, 0] = pursuers[b, i, 0] + (old_vx if physics.move_first else vx) * dt
-            moved[i, 1] = pursuers[b, i, 1] + (old_vy if physics.move_first else vy) * dt
-        pursuers[b] = moved
-        if physics.hard_contacts:
-            _separate(b, pursuers, target, discs, physics)
-        for i in range(n):
-            for axis in range(2):
-                if abs(pursuers[b, i, axis]) > physics.half_width:
-                    pursuers[b, i, axis] = np.copysign(physics.half_width, pursuers[b, i, axis])
-                    velocities[b, i, axis] = 0.0
+    for i in range(n):
+        fx, fy = 0.0, 0.0
+        if physics.soft_contacts:
+            fx, fy = _contact_force(b, i, pursuers, target, discs, physics)
+        ax = min(max(actions[b, i, 0], -1.0), 1.0)
+        ay = min(max(actions[b, i, 1], -1.0), 1.0)
+        old_vx, old_vy = velocities[b, i, 0], velocities[b, i, 1]
+        if physics.first_order:
+            vx = physics.max_speed * ax + fx / physics.mass * dt
+            vy = physics.max_speed * ay + fy / physics.mass * dt
+        else:
+            vx = (1 - physics.damping) * old_vx + (physics.acceleration * ax + fx / physics.mass) * dt
+            vy = (1 - physics.damping) * old_vy + (physics.acceleration * ay + fy / physics.mass) * dt
+        speed = np.sqrt(vx * vx + vy * vy)
+        if speed > physics.max_speed:
+            vx *= physics.max_speed / speed
+            vy *= physics.max_speed / speed
+        velocities[b, i, 0] = vx
+        velocities[b, i, 1] = vy
+        moved[i, 0] = pursuers[b, i, 0] + (old_vx if physics.move_first else vx) * dt
+        moved[i, 1] = pursuers[b, i, 1] + (old_vy if physics.move_first else vy) * dt
+    for i in range(n):
+        pursuers[b, i, 0], pursuers[b, i, 1] = moved[i, 0], moved[i, 1]
+    if physics.hard_contacts:
+        _separate(b, pursuers, target, discs, physics)
+    for i in range(n):
+        for axis in range(2):
+            if abs(pursuers[b, i, axis]) > physics.half_width:
+                pursuers[b, i, axis] = np.copysign(physics.half_width, pursuers[b, i, axis])
+                velocities[b, i, axis] = 0.0
 
 
 @kernel
@@ -207,116 +200,120 @@ def _overlap(dx: float, dy: float, reach: float) -> tuple[float, float]:
 
 
 @kernel
-def repulsion(
-    worlds: Worlds,
-    pursuers: Array,
-    target: Array,
-    discs: Array,
-    speed_ratio: Array,
-    safety_distance: Array,
-    constants: Constants,
-) -> None:
-    """Move the target of ``worlds`` away from everything, in place: Eq. 14 as its text says.
-
-    The sum of (T - X) / d^(power + 1) over pursuers, obstacles and the foot points on the four walls gives the
-    direction (Eq. 14 as printed attracts). An obstacle of several discs weighs as much as one of one disc.
-
-    :param pursuers: the positions that the target sees, (B, N, 2)
-    :param target: (B, 2)
-    :param discs: (B, D, 3)
-    :param speed_ratio: lambda, (B,)
-    :param safety_distance: d_safe, (B,)
-    :param constants: see :func:`physics_of`
-    """
-    physics = constants[0]
-    weight = physics.units / max(discs.shape[1], 1)
-    half = physics.half_width
-    for b in worlds:
-        x, y = target[b, 0], target[b, 1]
-        fx, fy = 0.0, 0.0
-        for i in range(pursuers.shape[1]):
-            px, py = _repel(x - pursuers[b, i, 0], y - pursuers[b, i, 1], physics.pursuer_radius, physics)
-            fx += px
-            fy += py
-        for d in range(discs.shape[1]):
-            px, py = _repel(x - discs[b, d, 0], y - discs[b, d, 1], discs[b, d, 2], physics)
-            fx += weight * px
-            fy += weight * py
-        fx += physics.wall_weight * (_repel(x + half, 0.0, 0.0, physics)[0] + _repel(x - half, 0.0, 0.0, physics)[0])
-        fy += physics.wall_weight * (_repel(0.0, y + half, 0.0, physics)[1] + _repel(0.0, y - half, 0.0, physics)[1])
-        _follow_path(b, fx, fy, pursuers, target, discs, speed_ratio[b], safety_distance[b], physics)
-
-
-@kernel
-def _repel(dx: float, dy: float, radius: float, physics: Physics) -> tuple[float, float]:
-    """Return the force at (dx, dy) from a body: along (dx, dy), falling with distance to the power."""
-    centre = np.sqrt(dx * dx + dy * dy)
-    gap = centre - (radius + physics.target_radius) * physics.from_surface
-    softened = np.sqrt(max(gap, 1e-6) ** 2 + physics.repulsion_softening**2)
-    fall = softened * softened if physics.repulsion_power == 2 else softened
-    force = 1.0 / (fall * max(centre, 1e-6))
-    return force * dx, force * dy
-
-
-@kernel
-def still(
-    worlds: Worlds,
-    pursuers: Array,
-    target: Array,
-    discs: Array,
-    speed_ratio: Array,
-    safety_distance: Array,
-    constants: Constants,
-) -> None:
-    """Leave the target where it is: a scene in which only the pursuers move."""
-
-
-@kernel
-def _follow_path(
+def move_target(
     b: int,
-    fx: float,
-    fy: float,
-    pursuers: Array,
+    seen: Array,
     target: Array,
     discs: Array,
     speed_ratio: float,
     safety_distance: float,
     physics: Physics,
 ) -> None:
-    """Move the target along (fx, fy) to the farthest sample before the first invalid one (Sec. 5.1).
+    """Move the target of world b by one step: along the force of its kind in ``TARGETS``, as far as is safe.
 
-    A sample is invalid within ``safety_distance`` of a pursuer, in contact with an obstacle, or outside. Under
-    the relaxed rule a sample near a body is valid if the target comes no nearer to it than it is now.
+    :param seen: the pursuers' positions that the target goes by, (N, 2)
+    :param target: (B, 2)
+    :param discs: (B, D, 3)
+    :param speed_ratio: lambda
+    :param safety_distance: d_safe [scene units]
+    :param physics: see :func:`physics_of`
     """
+    fx, fy = 0.0, 0.0
+    if physics.target == 0:
+        fx, fy = repulsion(seen, target[b], discs[b], physics)
+    elif physics.target == 1:
+        fx, fy = still(seen, target[b], discs[b], physics)
     force = np.sqrt(fx * fx + fy * fy)
-    if not force > 0.0:
-        return
-    stride = speed_ratio * physics.max_speed * physics.time_step / physics.path_samples
-    sx, sy = stride * fx / force, stride * fy / force
-    x, y = target[b, 0], target[b, 1]
-    reached = 0
-    for s in range(1, physics.path_samples + 1):
-        tx, ty = x + s * sx, y + s * sy
-        valid = abs(tx) <= physics.half_width and abs(ty) <= physics.half_width
-        for i in range(pursuers.shape[1]):
-            px, py = pursuers[b, i, 0], pursuers[b, i, 1]
-            valid &= _is_valid(tx - px, ty - py, x - px, y - py, safety_distance, physics.relaxed_path)
-        for d in range(discs.shape[1]):
-            px, py = discs[b, d, 0], discs[b, d, 1]
-            reach = discs[b, d, 2] + physics.target_radius + physics.obstacle_margin
-            valid &= _is_valid(tx - px, ty - py, x - px, y - py, reach, physics.relaxed_path)
-        if not valid:
-            break
-        reached = s
-    target[b, 0] = x + reached * sx
-    target[b, 1] = y + reached * sy
+    if force > 0.0:
+        stride = speed_ratio * physics.max_speed * physics.time_step / physics.path_samples
+        _follow_path(seen, target[b], discs[b], stride * fx / force, stride * fy / force, safety_distance, physics)
 
 
 @kernel
-def _is_valid(dx: float, dy: float, now_x: float, now_y: float, reach: float, relaxed: bool) -> bool:
-    square = dx * dx + dy * dy
-    return square >= reach * reach or (relaxed and square >= now_x * now_x + now_y * now_y)
+def repulsion(seen: Array, target: Array, discs: Array, physics: Physics) -> tuple[float, float]:
+    """Return the force that drives the target away from everything: Eq. 14 as its text says.
+
+    The sum of (T - X) / d^(power + 1) over pursuers, obstacles and the foot points on the four walls (Eq. 14 as printed
+    attracts). An obstacle of several discs weighs as much as one of one disc.
+
+    :param seen: (N, 2)
+    :param target: (2,)
+    :param discs: (D, 3)
+    """
+    x, y = target[0], target[1]
+    fx, fy = 0.0, 0.0
+    for i in range(len(seen)):
+        px, py = _repel(x - seen[i, 0], y - seen[i, 1], physics.pursuer_radius, physics)
+        fx += px
+        fy += py
+    weight = physics.units / max(len(discs), 1)
+    for d in range(len(discs)):
+        px, py = _repel(x - discs[d, 0], y - discs[d, 1], discs[d, 2], physics)
+        fx += weight * px
+        fy += weight * py
+    half, wall = physics.half_width, physics.wall_weight
+    fx += wall * (_repel(x + half, 0.0, 0.0, physics)[0] + _repel(x - half, 0.0, 0.0, physics)[0])
+    fy += wall * (_repel(0.0, y + half, 0.0, physics)[1] + _repel(0.0, y - half, 0.0, physics)[1])
+    return fx, fy
 
 
-TARGETS: dict[str, Callable[..., None]] = {"repulsion": repulsion, "still": still}
-"""How the target may move, by the name in ``Scenario.target``."""
+@kernel
+def _repel(dx: float, dy: float, radius: float, physics: Physics) -> tuple[float, float]:
+    """Return the force at (dx, dy) from a body: along (dx, dy), falling with distance to the power."""
+    centre = np.sqrt(dx * dx + dy * dy)
+    gap = max(centre - (radius + physics.target_radius) * physics.from_surface, 1e-6)
+    fall = gap * gap + physics.repulsion_softening * physics.repulsion_softening
+    if physics.repulsion_power == 1:
+        fall = np.sqrt(fall)
+    force = 1.0 / (fall * max(centre, 1e-6))
+    return force * dx, force * dy
+
+
+@kernel
+def still(seen: Array, target: Array, discs: Array, physics: Physics) -> tuple[float, float]:
+    """Return no force: a scene in which only the pursuers move."""
+    return 0.0, 0.0
+
+
+@kernel
+def _follow_path(
+    seen: Array, target: Array, discs: Array, sx: float, sy: float, safety_distance: float, physics: Physics
+) -> None:
+    """Move the target in strides (sx, sy) to the farthest sample before the first invalid one (Sec. 5.1).
+
+    A sample is invalid within ``safety_distance`` of a pursuer, in contact with an obstacle, or outside. Under the
+    relaxed rule a sample near a body is valid if the target comes no nearer to it than it is now.
+    """
+    x, y = target[0], target[1]
+    strides = physics.path_samples
+    while strides > 0 and not (
+        abs(x + strides * sx) <= physics.half_width and abs(y + strides * sy) <= physics.half_width
+    ):
+        strides -= 1  # the scene is convex: what is beyond the first sample outside is outside too
+    relaxed = physics.relaxed_path
+    for i in range(len(seen)):
+        strides = _valid_strides(x - seen[i, 0], y - seen[i, 1], sx, sy, safety_distance, relaxed, strides)
+    for d in range(len(discs)):
+        reach = discs[d, 2] + physics.target_radius + physics.obstacle_margin
+        strides = _valid_strides(x - discs[d, 0], y - discs[d, 1], sx, sy, reach, relaxed, strides)
+    target[0] = x + strides * sx
+    target[1] = y + strides * sy
+
+
+@kernel
+def _valid_strides(dx: float, dy: float, sx: float, sy: float, reach: float, relaxed: bool, strides: int) -> int:
+    """Return how many of ``strides`` come before the first that is invalid beside one body at -(dx, dy)."""
+    now = dx * dx + dy * dy
+    length = strides * np.sqrt(sx * sx + sy * sy)
+    if now > (reach + length) * (reach + length) * (1 + 1e-9):  # out of reach of the whole path
+        return strides
+    limit = min(reach * reach, now) if relaxed else reach * reach
+    for s in range(1, strides + 1):
+        tx, ty = dx + s * sx, dy + s * sy
+        if tx * tx + ty * ty < limit:
+            return s - 1
+    return strides
+
+
+TARGETS: dict[str, Callable[..., tuple[float, float]]] = {"repulsion": repulsion, "still": still}
+"""The target's driving force by the name in ``Scenario.target``, in the order of :func:`move_target`'s branches."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle.core.compilation import kernel
-from marl_encircle.core.dynamics import Constants, Physics
+from marl_encircle.core.dynamics import Physics
 
 Array = NDArray[np.float64]
 
@@ -89,13 +89,13 @@ def half_circle(n_directions: int) -> Array:
 
 @kernel
 def enclose(
-    worlds: NDArray[np.int64],
+    b: int,
     pursuers: Array,
     target: Array,
     discs: Array,
-    speed_ratio: Array,
+    speed_ratio: float,
     rays: Array,
-    constants: Constants,
+    physics: Physics,
     owner: NDArray[np.int8],
     nearness: Array,
     contributing_angle: Array,
@@ -104,49 +104,47 @@ def enclose(
     complete: NDArray[np.bool_],
     target_distance: Array,
     contacts: NDArray[np.int64],
+    met: Array,
 ) -> None:
-    """Measure ``worlds``: fill in the fields of :class:`Enclosure` and :class:`Measure`.
+    """Measure world b: fill in its row of the fields of :class:`Enclosure` and :class:`Measure`.
 
-    The last eight arrays are filled in. Their first axis, 2 long, is the closure rule (all, pursuers), or in
+    ``owner`` to ``contacts`` are filled in. Their first axis, 2 long, is the closure rule (all, pursuers), or in
     ``contacts``, 3 long, what is touched (pursuers, target, obstacles).
 
     :param pursuers: (B, N, 2)
     :param target: (B, 2)
     :param discs: (B, D, 3)
-    :param speed_ratio: lambda, (B,)
+    :param speed_ratio: lambda
     :param rays: see :func:`half_circle`, (2, K/2)
-    :param constants: see :func:`marl_encircle.core.dynamics.physics_of`
+    :param physics: see :func:`marl_encircle.core.dynamics.physics_of`
+    :param met: scratch, (K,)
     """
-    physics = constants[0]
-    n = pursuers.shape[1]
+    n, n_directions = pursuers.shape[1], len(met)
     discs_per_unit = discs.shape[1] // max(contributing_angle.shape[2] - n, 1)
-    n_directions = 2 * rays.shape[1]
-    met = np.empty(n_directions)
-    for b in worlds:
-        owner[1, b] = NOBODY
-        nearness[1, b] = 0.0
-        for i in range(n):
-            x, y = pursuers[b, i, 0] - target[b, 0], pursuers[b, i, 1] - target[b, 1]
-            target_distance[b, i] = np.sqrt(x * x + y * y)
-            square = x * x + y * y
-            if square < TINY * TINY:  # a pursuer on the target has no bearing; it blocks a cone around the x axis
-                x, y, square = TINY, 0.0, TINY * TINY
-            _meet(x / square, y / square, (1.0 - 1.0 / speed_ratio[b] ** 2) / square, rays, met)
-            _keep_nearest(i, met, nearness[1, b], owner[1, b])
-        owner[0, b] = owner[1, b]
-        nearness[0, b] = nearness[1, b]
-        for d in range(discs.shape[1]):
-            x, y = discs[b, d, 0] - target[b, 0], discs[b, d, 1] - target[b, 1]
-            reach = discs[b, d, 2] + physics.target_radius
-            scale = 1.0 / max(x * x + y * y - reach * reach, TINY)
-            _meet(x * scale, y * scale, scale, rays, met)
-            _keep_nearest(n + d // discs_per_unit, met, nearness[0, b], owner[0, b])
-        for rule in range(2):
-            owned = _share_out(owner[rule, b], contributing_angle[rule, b])
-            occupied_angle[rule, b] = owned * (2 * np.pi / n_directions)
-            movement_range[rule, b] = _area(nearness[rule, b]) if owned == n_directions else np.inf
-            complete[rule, b] = movement_range[rule, b] < physics.movement_range_limit
-        _count_contacts(b, pursuers, discs, target_distance, physics, contacts)
+    for k in range(n_directions):
+        owner[1, b, k], nearness[1, b, k] = NOBODY, 0.0
+    for i in range(n):
+        x, y = pursuers[b, i, 0] - target[b, 0], pursuers[b, i, 1] - target[b, 1]
+        square = x * x + y * y
+        target_distance[b, i] = np.sqrt(square)
+        if square < TINY * TINY:  # a pursuer on the target has no bearing; it blocks a cone around the x axis
+            x, y, square = TINY, 0.0, TINY * TINY
+        _meet(x / square, y / square, (1.0 - 1.0 / (speed_ratio * speed_ratio)) / square, rays, met)
+        _keep_nearest(i, met, nearness[1, b], owner[1, b])
+    for k in range(n_directions):
+        owner[0, b, k], nearness[0, b, k] = owner[1, b, k], nearness[1, b, k]
+    for d in range(discs.shape[1]):
+        x, y = discs[b, d, 0] - target[b, 0], discs[b, d, 1] - target[b, 1]
+        reach = discs[b, d, 2] + physics.target_radius
+        scale = 1.0 / max(x * x + y * y - reach * reach, TINY)
+        _meet(x * scale, y * scale, scale, rays, met)
+        _keep_nearest(n + d // discs_per_unit, met, nearness[0, b], owner[0, b])
+    for rule in range(2):
+        owned = _share_out(owner[rule, b], contributing_angle[rule, b])
+        occupied_angle[rule, b] = owned * (2 * np.pi / n_directions)
+        movement_range[rule, b] = _area(nearness[rule, b]) if owned == n_directions else np.inf
+        complete[rule, b] = movement_range[rule, b] < physics.movement_range_limit
+    _count_contacts(b, pursuers, discs, target_distance, physics, contacts)
 
 
 @kernel

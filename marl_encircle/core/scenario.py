@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from marl_encircle.core.dynamics import TARGETS
 from marl_encircle.core.scenes import SCENES
 
 Extra = Literal["occupied_angle", "stage", "speed_ratio"]
@@ -115,8 +116,9 @@ class Scenario:
                 object.__setattr__(self, f.name, float(getattr(self, f.name)))
         if self.n_directions % 2:
             raise ValueError(f"n_directions must be even (each direction has its opposite); got {self.n_directions}")
-        if self.scene not in SCENES:
-            raise ValueError(f"scene must be one of {', '.join(SCENES)}; got {self.scene!r}")
+        for name, known in (("scene", SCENES), ("target", TARGETS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}; got {getattr(self, name)!r:.80}")
         if self.cover > MAX_COVER:
             raise ValueError(
                 f"too many bodies to place: obstacles, pursuers and target cover {self.cover:.0%} of the scene; "

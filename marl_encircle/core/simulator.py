@@ -7,8 +7,10 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_encircle.core import dynamics, geometry, scenes
-from marl_encircle.core.geometry import Enclosure, Measure
+from marl_encircle.core import geometry, scenes
+from marl_encircle.core.compilation import kernel
+from marl_encircle.core.dynamics import Constants, move_pursuers, move_target, physics_of
+from marl_encircle.core.geometry import Enclosure, Measure, enclose
 from marl_encircle.core.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -73,14 +75,14 @@ class Simulator:
         self.scenario = scenario
         self.n_worlds = n_worlds
         self.steps = np.zeros(n_worlds, np.int64)
-        self._physics = dynamics.physics_of(scenario)
-        self._move_target = _target(scenario.target)
+        self._physics = physics_of(scenario)
         self._rays = geometry.half_circle(scenario.n_directions)
         self._shape = scenes.SCENES[scenario.scene]()
         self._everywhere = np.arange(n_worlds)
         self._actions_shape = (n_worlds, scenario.pursuers, 2)
         self._difficulty: Difficulty = {}
-        self.state = self._empty_state()
+        self.state = s = self._empty_state()
+        self._arrays = (s.pursuers, s.velocities, s.target, s.discs, s.speed_ratio, s.safety_distance, self.steps)
         self._present, self._former = _MeasureBuffers(scenario, n_worlds), _MeasureBuffers(scenario, n_worlds)
         self._streams: list[np.random.Generator] = []
         self.seed(seed)
@@ -141,15 +143,17 @@ class Simulator:
         :return: the measure of the new state, valid until the step after the next
         :raises ValueError: for actions of a wrong shape, or not finite, naming world and pursuer; nothing moves then
         """
-        actions = self._checked(actions)
-        s = self.state
-        seen = s.pursuers.copy() if self.scenario.turn_order == "simultaneous" else s.pursuers
-        dynamics.move_pursuers(self._everywhere, actions, s.pursuers, s.velocities, s.target, s.discs, self._physics)
-        self._move_target(self._everywhere, seen, s.target, s.discs, s.speed_ratio, s.safety_distance, self._physics)
+        array = np.ascontiguousarray(actions, dtype=np.float64)
+        if array.shape != self._actions_shape:
+            raise ValueError(f"actions must have shape {self._actions_shape} (worlds, pursuers, 2); got {array.shape}")
         self._present, self._former = self._former, self._present
-        self._enclose(self._everywhere)
-        self.steps += 1
-        return self.measure
+        slot = _advance(array, *self._arrays, self._rays, self._physics, *self._present.arrays)
+        if slot >= 0:
+            self._present, self._former = self._former, self._present
+            world, pursuer = divmod(slot, self.scenario.pursuers)
+            name = self.scenario.agents[pursuer]
+            raise ValueError(f"the action of {name} in world {world} is not finite: {array[world, pursuer]}")
+        return self._present.measure
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the future depends on, as arrays and plain numbers."""
@@ -170,21 +174,9 @@ class Simulator:
             stream.bit_generator.state = stream_state
         self._enclose(self._everywhere)
 
-    def _checked(self, actions: ArrayLike) -> Array:
-        array = np.ascontiguousarray(actions, dtype=np.float64)
-        if array.shape != self._actions_shape:
-            raise ValueError(f"actions must have shape {self._actions_shape} (worlds, pursuers, 2); got {array.shape}")
-        slot = dynamics.first_bad_action(array)
-        if slot >= 0:
-            world, pursuer = divmod(slot, self.scenario.pursuers)
-            raise ValueError(
-                f"the action of {self.scenario.agents[pursuer]} in world {world} is not finite: {array[world, pursuer]}"
-            )
-        return array
-
     def _enclose(self, worlds: NDArray[np.int64]) -> None:
         s = self.state
-        geometry.enclose(
+        _enclose_worlds(
             worlds, s.pursuers, s.target, s.discs, s.speed_ratio, self._rays, self._physics, *self._present.arrays
         )
 
@@ -264,7 +256,105 @@ class _MeasureBuffers:
         )
 
 
-def _target(name: str) -> Any:
-    if name not in dynamics.TARGETS:
-        raise ValueError(f"target must be one of {', '.join(dynamics.TARGETS)}; got {name!r}")
-    return dynamics.TARGETS[name]
+@kernel
+def _advance(
+    actions: Array,
+    pursuers: Array,
+    velocities: Array,
+    target: Array,
+    discs: Array,
+    speed_ratio: Array,
+    safety_distance: Array,
+    steps: NDArray[np.int64],
+    rays: Array,
+    constants: Constants,
+    owner: NDArray[np.int8],
+    nearness: Array,
+    contributing_angle: Array,
+    occupied_angle: Array,
+    movement_range: Array,
+    complete: NDArray[np.bool_],
+    target_distance: Array,
+    contacts: NDArray[np.int64],
+) -> int:
+    """Move and measure every world; return -1, or the slot of the first action that is not finite, nothing moved."""
+    for slot in range(actions.size):
+        if not np.isfinite(actions.flat[slot]):
+            return slot // 2
+    physics = constants[0]
+    n_worlds, n = pursuers.shape[:2]
+    moved, seen, met = np.empty((n, 2)), np.empty((n, 2)), np.empty(2 * rays.shape[1])
+    for b in range(n_worlds):
+        _copy(pursuers[b], seen)
+        move_pursuers(b, actions, pursuers, velocities, target, discs, physics, moved)
+        if physics.target_sees_moves:
+            _copy(pursuers[b], seen)
+        move_target(b, seen, target, discs, speed_ratio[b], safety_distance[b], physics)
+        enclose(
+            b,
+            pursuers,
+            target,
+            discs,
+            speed_ratio[b],
+            rays,
+            physics,
+            owner,
+            nearness,
+            contributing_angle,
+            occupied_angle,
+            movement_range,
+            complete,
+            target_distance,
+            contacts,
+            met,
+        )
+        steps[b] += 1
+    return -1
+
+
+@kernel
+def _copy(source: Array, destination: Array) -> None:
+    """Copy an (N, 2) array; Numba's own assignment checks shapes and overlaps, which costs more than the copy."""
+    for i in range(len(source)):
+        destination[i, 0], destination[i, 1] = source[i, 0], source[i, 1]
+
+
+@kernel
+def _enclose_worlds(
+    worlds: NDArray[np.int64],
+    pursuers: Array,
+    target: Array,
+    discs: Array,
+    speed_ratio: Array,
+    rays: Array,
+    constants: Constants,
+    owner: NDArray[np.int8],
+    nearness: Array,
+    contributing_angle: Array,
+    occupied_angle: Array,
+    movement_range: Array,
+    complete: NDArray[np.bool_],
+    target_distance: Array,
+    contacts: NDArray[np.int64],
+) -> None:
+    """Measure some worlds as they are."""
+    met = np.empty(2 * rays.shape[1])
+    for b in worlds:
+        enclose(
+            b,
+            pursuers,
+            target,
+            discs,
+            speed_ratio[b],
+            rays,
+            constants[0],
+            owner,
+            nearness,
+            contributing_angle,
+            occupied_angle,
+            movement_range,
+            complete,
+            target_distance,
+            contacts,
+            met,
+        )
