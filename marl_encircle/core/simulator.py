@@ -226,7 +226,8 @@ class Simulator:
             s.discs,
             s.obstacles,
         )
-        return worlds[~placed]
+        unplaced: NDArray[np.int64] = worlds[~placed]
+        return unplaced
 
 
 class _MeasureBuffers:
