@@ -126,7 +126,7 @@ def test_the_package_works_where_nothing_of_the_users_can_be_written(tmp_path: P
         "from marl_encircle.core import compilation\n"
         "print(_area(np.ones(8)), compilation._CACHE_FOLDER.parent, any(compilation._CACHE_FOLDER.rglob('*.nbi')))"
     )
-    nowhere = {name: "/proc/nowhere" for name in ("HOME", "XDG_CACHE_HOME", "MARL_ENCIRCLE_CACHE")}
+    nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME", "MARL_ENCIRCLE_CACHE"), "/proc/nowhere")
     out = run(code, PACKAGE.parent.parent, TMPDIR=str(tmp_path), **nowhere)
     assert out == f"{np.pi} {tmp_path} True"
 
