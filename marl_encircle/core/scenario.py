@@ -13,6 +13,9 @@ Extra = Literal["occupied_angle", "stage", "speed_ratio"]
 MAX_COVER = 0.5
 """Share of the scene that bodies may cover; denser scenes cannot be drawn by random placement (jamming is at 0.547)."""
 
+MAX_ENTITIES = 128
+"""Most pursuers and obstacles together: a direction's owner is one byte."""
+
 
 def _bounded(default: float, low: float, high: float = math.inf) -> Any:
     return field(default=default, metadata={"low": low, "high": high})
@@ -119,6 +122,11 @@ class Scenario:
         for name, known in (("scene", SCENES), ("target", TARGETS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}; got {getattr(self, name)!r:.80}")
+        if self.pursuers + self.units > MAX_ENTITIES:
+            raise ValueError(
+                f"too many obstacles: {self.pursuers} pursuers and {self.units} obstacles (discs, unless composite_unit) "
+                f"have owners of directions numbered beyond {MAX_ENTITIES - 1}"
+            )
         if self.cover > MAX_COVER:
             raise ValueError(
                 f"too many bodies to place: obstacles, pursuers and target cover {self.cover:.0%} of the scene; "
