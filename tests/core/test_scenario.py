@@ -95,6 +95,16 @@ def test_too_many_bodies_to_place_are_refused_by_their_cover() -> None:
     assert Scenario(scene="tunnel").cover == pytest.approx(math.pi * (1.6 * 0.04 + 4 * 0.0025) / 4)
 
 
+def test_more_bodies_than_a_byte_can_number_are_refused() -> None:
+    many = {"scene": "tunnel", "obstacle_radius": 0.02, "composite_unit": False}
+    assert "too many obstacles: 9 pursuers and 120 obstacles" in refused(pursuers=9, obstacles=12, **many)
+    sim = Simulator(Scenario(pursuers=8, obstacles=12, **many), 20, 0)
+    angles = sim.reset().enclosure["all"].contributing_angle
+    assert angles.shape == (20, 128)
+    assert angles[:, -10:].sum() > 0
+    Scenario(pursuers=64, obstacles=64, pursuer_radius=0.01, obstacle_radius=0.01)
+
+
 def test_a_misspelt_field_is_an_error() -> None:
     with pytest.raises(TypeError, match="pursuer_count"):
         Scenario(pursuer_count=3)  # type: ignore[call-arg]
