@@ -124,8 +124,8 @@ class Scenario:
                 raise ValueError(f"{name} must be one of {', '.join(known)}; got {getattr(self, name)!r:.80}")
         if self.pursuers + self.units > MAX_ENTITIES:
             raise ValueError(
-                f"too many obstacles: {self.pursuers} pursuers and {self.units} obstacles (discs, unless composite_unit) "
-                f"have owners of directions numbered beyond {MAX_ENTITIES - 1}"
+                f"too many obstacles: {self.pursuers} pursuers and {self.units} obstacles (each disc is one unless "
+                f"composite_unit); at most {MAX_ENTITIES} together can be told apart"
             )
         if self.cover > MAX_COVER:
             raise ValueError(
