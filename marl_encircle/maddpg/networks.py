@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 
 class StackedMLP(nn.Module):
@@ -102,6 +103,7 @@ class ReLULayers(th.autograd.Function):
         return activations[-1]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """Return the gradients of ``x``, W_1, b_1, W_2 ..."""
         n_layers = len(ctx.saved_tensors) // 2
@@ -140,6 +142,7 @@ class Heads(th.autograd.Function):
         return padded.bmm(hidden.mT)[:, : rows.shape[1]].mT
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
         """Return the gradients of ``hidden`` and ``weight``."""
         hidden, rows = ctx.saved_tensors
@@ -160,7 +163,7 @@ class AgentFeatures(BaseFeaturesExtractor):
 
     def __init__(
         self, observation_space: spaces.Space[Any], extractors: Sequence[BaseFeaturesExtractor], n_agents: int
-    ):
+    ) -> None:
         super().__init__(observation_space, extractors[0].features_dim)
         self.extractors = nn.ModuleList(extractors)
         self.n_agents = n_agents

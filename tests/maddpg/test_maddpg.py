@@ -1,13 +1,15 @@
 import hashlib
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import supersuit
 import torch as th
 from gymnasium import spaces
+from pettingzoo import ParallelEnv
 from slot_envs import IdentityWorlds, LabelledWorlds
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
@@ -350,7 +352,7 @@ def test_plain_gymnasium_environments_have_one_agent_each() -> None:
 
 
 class HidesAgents(VecEnvWrapper):
-    """Slots that do not tell what they are, as SuperSuit's wrapper for SB3."""
+    """Slots that do not tell what they are."""
 
     def __init__(self, venv: Any) -> None:
         super().__init__(venv)
@@ -369,6 +371,26 @@ def test_slots_that_hide_their_agents_are_refused_unless_the_number_is_given() -
     assert make_model(env=HidesAgents(LabelledWorlds()), n_agents=3).n_agents == 3
     with pytest.raises(ValueError, match="12 slots are no whole number of worlds with n_agents=5"):
         make_model(env=HidesAgents(LabelledWorlds()), n_agents=5)
+
+
+def test_the_bare_supersuit_wrapper_is_refused() -> None:
+    class Parallel(ParallelEnv):
+        metadata: ClassVar[dict[str, Any]] = {"name": "parallel"}
+        possible_agents: ClassVar[list[str]] = ["agent_0", "agent_1"]
+        agents = possible_agents
+        render_mode = None
+
+        def observation_space(self, agent: str) -> spaces.Box:
+            return spaces.Box(-1, 1, (3,), np.float32)
+
+        def action_space(self, agent: str) -> spaces.Box:
+            return spaces.Box(-1, 1, (2,), np.float32)
+
+    slots = supersuit.pettingzoo_env_to_vec_env_v1(Parallel())
+    env = supersuit.concat_vec_envs_v1(slots, 3, base_class="stable_baselines3")
+    assert env.num_envs == 6
+    with pytest.raises(ValueError, match=r"make_vec_env.*n_agents="):
+        make_model(env=env)
 
 
 def test_a_number_of_agents_that_differs_from_the_environments_is_refused() -> None:
@@ -418,7 +440,11 @@ def test_predict_takes_slots_one_world_or_a_dict_by_agent() -> None:
     assert len(np.unique(same, axis=0)) == 3
 
 
-@pytest.mark.parametrize("observation", [np.zeros(3), np.zeros((4, 3)), {"agent_0": np.zeros(3)}], ids=str)
+@pytest.mark.parametrize(
+    "observation",
+    [np.zeros(3), np.zeros((4, 3)), {"agent_0": np.zeros(3)}, {f"agent_{i}": np.zeros(3) for i in range(6)}],
+    ids=["one row", "four rows", "one agent", "six agents"],
+)
 def test_predict_refuses_observations_of_some_agents(observation: Any) -> None:
     with pytest.raises(ValueError, match="observations of all 3 agents"):
         make_model().predict(observation)
@@ -436,6 +462,9 @@ def test_actions_are_scaled_to_the_action_space() -> None:
         assert env.action_space.contains(actions[0])
         # 0..10 and -3..-1 from -1..1
         np.testing.assert_allclose(actions, [5, -2] + scaled * [5, 1], rtol=1e-5, atol=1e-5)
+    model.exploration_noise = 0.0
+    actions, _ = model._sample_action(0, n_envs=12)
+    np.testing.assert_allclose(actions, model.predict(model._last_obs)[0], rtol=1e-5, atol=1e-5)
 
 
 def explored(model: MADDPG, n: int = 400) -> np.ndarray:
