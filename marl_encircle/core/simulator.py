@@ -244,7 +244,7 @@ class _MeasureBuffers:
         target_distance = np.zeros((b, n))
         contacts = np.zeros((3, b, n), np.int64)
         by_rule = (owner, nearness, contributing_angle, occupied_angle, movement_range, complete)
-        self.arrays = (*by_rule, target_distance, contacts)
+        self.arrays: tuple[Any, ...] = (*by_rule, target_distance, contacts)
         self.measure = Measure(
             enclosure={
                 "all": Enclosure(*(a[0] for a in by_rule)),

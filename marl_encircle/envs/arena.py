@@ -1,6 +1,6 @@
 """What every road to the ecosystem does in a step: move the worlds, reward the pursuers, tell which rounds are over."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,3 +82,12 @@ class Arena:
         terminated = measure.enclosure[closure].complete.copy()
         truncated = (sim.steps >= self.scenario.max_cycles) & ~terminated
         return Outcome(self.observe(), rewards.astype(np.float32), terminated, truncated)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the next steps depend on, as arrays and plain numbers."""
+        return {"simulator": self.simulator.get_state(), "rounds": self.rounds.get_state()}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Go on from what :meth:`get_state` returned, bit for bit."""
+        self.simulator.set_state(saved["simulator"])
+        self.rounds.set_state(saved["rounds"])

@@ -176,6 +176,15 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             infos,
         )
 
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the next steps depend on, for an exact resume in the middle of a round."""
+        return self._arena.get_state()
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Go on from what :meth:`get_state` returned, bit for bit."""
+        self._arena.set_state(saved)
+        self.agents = self.possible_agents[:]
+
     def state(self) -> Array:
         """Return the world as a whole, in ``state_space``: what a central critic needs and no single pursuer sees.
 

@@ -183,8 +183,8 @@ class _Scene:
         self.surface.set_clip(None)
         self._draw_obstacles()
         self._draw_ring()
-        self._draw_target()
         self._draw_pursuers()
+        self._draw_target()
 
     def _pixel(self, place: Array) -> tuple[float, float]:
         """Return where a place in the scene lies on the surface; y points up in the scene, down in the picture."""

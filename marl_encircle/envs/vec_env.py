@@ -135,15 +135,14 @@ class EncirclementVecEnv(VecEnv):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next steps depend on, for an exact resume."""
-        return {"simulator": self.simulator.get_state(), "rounds": self.rounds.get_state()}
+        return self._arena.get_state()
 
     def set_state(self, saved: dict[str, Any]) -> NDArray[np.float32]:
         """Go on from what :meth:`get_state` returned.
 
         :return: the present observations, (B * N, O)
         """
-        self.simulator.set_state(saved["simulator"])
-        self.rounds.set_state(saved["rounds"])
+        self._arena.set_state(saved)
         return self._slots(self._arena.observe())
 
     def _slots(self, per_world: NDArray[np.float32]) -> NDArray[np.float32]:
