@@ -1,0 +1,35 @@
+"""The step that all engines share."""
+
+import numpy as np
+
+from marl_encircle.core.rewards import Reward
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.envs.arena import Arena
+
+
+def test_an_outcome_stays_as_it_was() -> None:
+    arena = Arena(Scenario(pursuers=6, obstacles=4, movement_range_limit=100.0, max_cycles=3), Reward(), 32)
+    arena.simulator.seed(0)
+    arena.reset()
+    rng = np.random.default_rng(0)
+    kept, copies = [], []
+    for _ in range(12):
+        outcome = arena.step(rng.uniform(-1, 1, (32, 6, 2)))
+        kept.append(outcome)
+        copies.append([array.copy() for array in outcome])
+        over = np.flatnonzero(outcome.terminated | outcome.truncated)
+        arena.restart(over, outcome.observations.copy())
+    assert any(outcome.terminated.any() for outcome in kept)
+    for outcome, copy in zip(kept, copies, strict=True):
+        for array, before in zip(outcome, copy, strict=True):
+            assert np.array_equal(array, before)
+
+
+def test_no_world_is_both_terminated_and_truncated() -> None:
+    arena = Arena(Scenario(pursuers=6, obstacles=4, movement_range_limit=100.0, max_cycles=1), Reward(), 64)
+    arena.simulator.seed(0)
+    arena.reset()
+    outcome = arena.step(np.zeros((64, 6, 2)))
+    assert np.array_equal(outcome.terminated, ~outcome.truncated)
+    assert outcome.terminated.any()
+    assert outcome.truncated.any()
