@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import Logger, configure
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint
-from marl_encircle.experiments.build import Engine, build_model, build_vec_env, policy_bytes, read_record
+from marl_encircle.experiments.build import Engine, build_model, build_vec_env, config_of, policy_bytes, read_record
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
     Diverged,
@@ -220,15 +220,16 @@ def cpu_model() -> str:
 
 def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:
     """Raise an OtherRunError unless the finished run in ``folder`` is of this configuration, seed and engine."""
-    record, plan = read_record(folder), _plan(config, seed, engine)
-    _check_same(folder, plan, {key: record.get(key) for key in plan})
+    _check_same(folder, _plan(config, seed, engine), read_record(folder))
 
 
 def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:
     return {"config": config.to_dict(), "seed": seed, "engine": engine}
 
 
-def _check_same(folder: Path, plan: dict[str, Any], other: dict[str, Any]) -> None:
+def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> None:
+    """Compare with what a run or a checkpoint was made with; fields that were added since have their defaults."""
+    other = _plan(config_of(record), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)
