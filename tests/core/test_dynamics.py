@@ -262,15 +262,15 @@ def test_the_walls_repel_from_their_foot_points() -> None:
 
 
 def test_an_obstacle_of_many_discs_repels_as_much_as_one_of_one_disc() -> None:
-    # Far away all discs of a tunnel are at its centre
+    # A tiny tunnel at (-0.3, -0.4): 1/0.25 = 4 along (0.6, 0.8); the pursuer 0.2 to the right pushes 25 left
     sim = Simulator(Scenario(pursuers=1, scene="tunnel", obstacle_radius=1e-4, contacts="off", wall_weight=0.0), 1, 0)
     sim.reset()
     saved = sim.get_state()
     state = saved["state"]
-    state["discs"][0, :, :2] += np.array([0.0, -0.4]) - state["obstacles"][0, 0]
-    state["pursuers"][0], state["target"][0] = (-0.2, 0.0), (0.0, 0.0)
+    state["discs"][0, :, :2] += np.array([-0.3, -0.4]) - state["obstacles"][0, 0]
+    state["pursuers"][0], state["target"][0] = (0.2, 0.0), (0.0, 0.0)
     sim.set_state(saved)
-    assert push(sim).state.target[0].tolist() == pytest.approx(list(along(25, 6.25)), abs=1e-4)
+    assert push(sim).state.target[0].tolist() == pytest.approx(list(along(2.4 - 25, 3.2)), abs=1e-4)
 
 
 def test_a_target_that_nothing_pushes_stays() -> None:
