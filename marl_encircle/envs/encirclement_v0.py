@@ -178,12 +178,13 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next steps depend on, for an exact resume in the middle of a round."""
-        return self._arena.get_state()
+        return {**self._arena.get_state(), "running": bool(self.agents)}
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Go on from what :meth:`get_state` returned, bit for bit."""
         self._arena.set_state(saved)
-        self.agents = self.possible_agents[:]
+        self.agents = self.possible_agents[:] if saved["running"] else []
+        self._trail.clear()
 
     def state(self) -> Array:
         """Return the world as a whole, in ``state_space``: what a central critic needs and no single pursuer sees.

@@ -241,6 +241,27 @@ def test_an_environment_travels_to_another_process_as_it_is() -> None:
         assert np.array_equal(list(env.step(still(env))[0].values()), list(copy.step(still(copy))[0].values()))
 
 
+@pytest.mark.parametrize("steps", [0, 17, 60])
+def test_a_saved_state_goes_on_as_if_never_stopped(steps: int) -> None:
+    env, other = parallel_env(), parallel_env(render_mode="rgb_array")
+    env.reset(seed=4)
+    other.reset(seed=5)
+    other.step(still(other))
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        env.step(random_actions(env, rng))
+    other.set_state(env.get_state())
+    assert other.agents == env.agents
+    assert other._trail == []  # it has not seen this round's past
+    for _ in range(100):
+        if not env.agents:
+            assert np.array_equal(env.reset()[0]["pursuer_0"], other.reset()[0]["pursuer_0"])
+        actions = random_actions(env, rng)
+        one, two = env.step(actions), other.step(actions)
+        assert np.array_equal(list(one[0].values()), list(two[0].values()))
+        assert one[1:] == two[1:]
+
+
 def test_the_turn_based_environment_plays_the_same_round() -> None:
     env, in_turn = parallel_env(), encirclement_v0.env()
     env.reset(seed=9)
