@@ -1,7 +1,43 @@
-"""Encircling a faster target with multi-agent reinforcement learning."""
+"""Encircling a faster target with multi-agent reinforcement learning.
+
+Importing the package registers ``pettingzoo.make("parallel", "marl_encircle/encirclement-v0")``. The names below are
+imported when they are first used, so that an environment alone does not load torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import pettingzoo
+
+if TYPE_CHECKING:
+    from marl_encircle.core.rewards import Reward
+    from marl_encircle.core.scenario import Scenario
+    from marl_encircle.envs.encirclement_v0 import parallel_env
+    from marl_encircle.experiments.build import load_policy, make_vec_env
+    from marl_encircle.maddpg import MADDPG, MATD3
+
+__all__ = ["MADDPG", "MATD3", "Reward", "Scenario", "load_policy", "make_vec_env", "parallel_env"]
+
+_HOMES = {
+    "MADDPG": "maddpg",
+    "MATD3": "maddpg",
+    "Reward": "core.rewards",
+    "Scenario": "core.scenario",
+    "load_policy": "experiments.build",
+    "make_vec_env": "experiments.build",
+    "parallel_env": "envs.encirclement_v0",
+}
 
 _ENVIRONMENT = "marl_encircle.envs.encirclement_v0"
 pettingzoo.register("parallel", "marl_encircle/encirclement-v0", f"{_ENVIRONMENT}:parallel_env")
 pettingzoo.register("aec", "marl_encircle/encirclement-v0", f"{_ENVIRONMENT}:env")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
