@@ -44,6 +44,11 @@ def test_the_first_worlds_have_the_same_seeds_whatever_the_number(seed: int, n: 
     assert all(0 <= s < 2**63 for s in seeds)
 
 
+def test_the_seeds_of_worlds_never_change_from_release_to_release() -> None:
+    first = np.random.SeedSequence(7).generate_state(2, np.uint64)
+    assert world_seeds(7, 2) == [int(word) // 2 for word in first]
+
+
 def test_a_world_is_the_same_alone_and_in_any_batch() -> None:
     together = Simulator(DENSE, 9, seed=4)
     alone = Simulator(DENSE, 1, seed=0)
@@ -179,6 +184,8 @@ def test_a_reset_leaves_the_other_worlds_alone() -> None:
     for name, array in before.items():
         np.testing.assert_array_equal(array[[0, 2]], after[name][[0, 2]], err_msg=name)
     assert after["steps"].tolist() == [3, 0, 3, 0]
+    assert (before["velocities"][[1, 3]] != 0).any()
+    assert (after["velocities"][[1, 3]] == 0).all()
     assert (after["target"][[1, 3]] != before["target"][[1, 3]]).all()
 
 
