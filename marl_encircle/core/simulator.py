@@ -104,7 +104,7 @@ class Simulator:
         """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
-        seeds = world_seeds(seed, self.n_worlds) if isinstance(seed, int) else list(seed)
+        seeds = world_seeds(int(seed), self.n_worlds) if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != self.n_worlds:
             raise ValueError(f"{self.n_worlds} worlds need {self.n_worlds} seeds; got {len(seeds)}")
         self._streams = [np.random.default_rng(s) for s in seeds]

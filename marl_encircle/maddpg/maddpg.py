@@ -63,7 +63,7 @@ class MADDPG(OffPolicyAlgorithm):
     :param n_agents: number of agents N, where the environment does not tell it by an attribute ``n_agents``
     :param critic: ``"per_agent"``: a critic per agent (Lowe et al.); ``"shared"``: one trunk with a head per agent
     :param exploration_noise: standard deviation of the Gaussian noise on scaled actions [-1, 1], a number or a
-        function of the progress remaining; by default 0.1, or none where ``action_noise`` is given
+        function of the progress remaining; by default 0.3, or none where ``action_noise`` is given
     :param exploration_random: share of actions that are replaced by uniformly random ones, a number or a function
         of the progress remaining
     :param policy_delay: critic updates per update of the actors and the targets
@@ -101,7 +101,7 @@ class MADDPG(OffPolicyAlgorithm):
         n_agents: int | None = None,
         critic: CriticKind = "per_agent",
         exploration_noise: float | Schedule | None = None,
-        exploration_random: float | Schedule = 0.0,
+        exploration_random: float | Schedule = 0.05,
         policy_delay: int = 1,
         max_grad_norm: float | None = None,
         actor_regularization: float = 1e-3,
@@ -132,7 +132,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.n_agents = n_agents
         self.critic_kind = critic
         if exploration_noise is None:
-            exploration_noise = 0.1 if action_noise is None else 0.0
+            exploration_noise = 0.3 if action_noise is None else 0.0
         self.exploration_noise = exploration_noise
         self.exploration_random = exploration_random
         self.policy_delay = policy_delay

@@ -474,7 +474,7 @@ def explored(model: MADDPG, n: int = 400) -> np.ndarray:
 
 
 def test_exploration_noise_has_its_standard_deviation_and_follows_its_schedule() -> None:
-    model = make_model(exploration_noise=lambda progress: 0.2 * progress)
+    model = make_model(exploration_noise=lambda progress: 0.2 * progress, exploration_random=0.0)
     greedy = model.predict(model.env.reset())[0]
     assert (explored(model) - greedy).std() == pytest.approx(0.2, rel=0.05)
     model._current_progress_remaining = 0.5
