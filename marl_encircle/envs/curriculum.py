@@ -30,6 +30,7 @@ class CurriculumVecEnv(VecEnvWrapper):
         super().__init__(venv)
         self.levels = dict(levels)
         self.world_steps = 0
+        self._last: dict[str, float] = {}
 
     @property
     def difficulty(self) -> dict[str, float]:
@@ -52,5 +53,7 @@ class CurriculumVecEnv(VecEnvWrapper):
         return self.venv.step_wait()
 
     def _set_difficulty(self) -> None:
-        if self.levels:
-            self.venv.env_method("set_difficulty", self.difficulty)
+        difficulty = self.difficulty
+        if difficulty != self._last:  # the worlds check it anew every time
+            self.venv.env_method("set_difficulty", difficulty)
+            self._last = difficulty
