@@ -1,9 +1,11 @@
 """Exact resume: one file that holds everything the rest of a training depends on.
 
 A checkpoint is a tree of dictionaries and lists with arrays and plain numbers in it. The arrays go into a safetensors
-file, the tree that refers to them into its metadata as JSON: no pickle, and one atomic write for all of it.
+file, the tree that refers to them and has their hashes into its metadata as JSON: no pickle, and one atomic write for
+all of it.
 """
 
+import hashlib
 import json
 import random
 from collections.abc import Mapping
@@ -33,20 +35,24 @@ def save_tree(path: Path, tree: Mapping[str, Any]) -> None:
     arrays: dict[str, np.ndarray] = {}
     plain = _take_arrays(tree, "", arrays)
     with files.atomic_path(path) as temporary:
-        safetensors.numpy.save_file(arrays, temporary, metadata={"tree": json.dumps(plain)})
+        text = json.dumps(plain)
+        metadata = {"tree": text, "sha256": files.sha256_bytes(text.encode())}
+        safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
 
 
 def load_tree(path: Path) -> dict[str, Any]:
     """Read what :func:`save_tree` wrote; tensors come back as arrays.
 
-    :raises DamagedFileError: if it is no such file
+    :raises DamagedFileError: if it is no such file, or a bit of it has changed
     """
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-            tree = json.loads(file.metadata()["tree"])
-        restored: dict[str, Any] = _put_arrays(tree, arrays)
-    except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+            metadata = file.metadata()
+        if files.sha256_bytes(metadata["tree"].encode()) != metadata["sha256"]:
+            raise ValueError("its tree has changed since it was written")
+        restored: dict[str, Any] = _put_arrays(json.loads(metadata["tree"]), arrays)
+    except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise files.DamagedFileError(path, f"is no checkpoint: {str(error)[:200]}") from error
     return restored
 
@@ -108,8 +114,9 @@ def _take_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, th.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
-        arrays[path] = np.asarray(value, order="C")
-        return {ARRAY: path}
+        name = f"{len(arrays)}{path}"
+        arrays[name] = np.asarray(value, order="C")
+        return {ARRAY: name, "sha256": _digest(arrays[name])}
     if isinstance(value, Mapping):
         return {str(key): _take_arrays(inner, f"{path}/{key}", arrays) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
@@ -121,12 +128,21 @@ def _take_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 def _put_arrays(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if isinstance(value, dict):
-        if set(value) == {ARRAY}:
+        if ARRAY in value:
+            if _digest(arrays[value[ARRAY]]) != value["sha256"]:
+                raise ValueError(f"{value[ARRAY]} has changed since it was written")
             return arrays[value[ARRAY]]
         return {key: _put_arrays(inner, arrays) for key, inner in value.items()}
     if isinstance(value, list):
         return [_put_arrays(inner, arrays) for inner in value]
     return value
+
+
+def _digest(array: np.ndarray) -> str:
+    """sha256 of an array's type, shape and numbers, in hexadecimal."""
+    digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+    digest.update(array.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def _to_torch(value: Any) -> Any:

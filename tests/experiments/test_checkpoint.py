@@ -1,0 +1,110 @@
+"""A checkpoint gives back exactly what was put in, or says that it cannot."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from marl_encircle import files
+from marl_encircle.experiments.checkpoint import load_tree, save_tree
+
+
+def tree() -> dict[str, Any]:
+    generator = np.random.default_rng(3)
+    return {
+        "plain": {"none": None, "yes": True, "no": False, "text": "λ/\n", "number": -0.1 + 0.3, "empty": {}},
+        "large": [2**127 + 1, -(2**90)],
+        "infinite": float("inf"),
+        "arrays": [np.arange(6.0).reshape(2, 3).T, np.zeros((0, 4)), np.array(7, np.int8), np.array([True, False])],
+        "a": {"b/c": np.ones(2)},
+        "a/b": {"c": np.zeros(2)},
+        "rng": generator.bit_generator.state,
+        "numpy": list(np.random.RandomState(1).get_state()),  # noqa: NPY002 - SB3 draws from such a one
+        "tensors": (th.full((2, 2), np.nan), th.tensor(3, dtype=th.int64), th.ones(2, dtype=th.uint8)),
+        "scalars": [np.float32(0.1), np.int64(3), np.bool_(True)],
+    }
+
+
+def assert_same(one: Any, other: Any) -> None:
+    if isinstance(one, th.Tensor):
+        one = one.numpy()
+    if isinstance(one, dict):
+        assert list(one) == list(other)
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        for left, right in zip(one, other, strict=True):
+            assert_same(left, right)
+    elif isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype
+        assert one.shape == other.shape
+        assert one.tobytes() == other.tobytes()
+    else:
+        assert one == other
+        assert isinstance(other, type(one)) or isinstance(one, np.generic)
+
+
+def test_a_tree_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    save_tree(path, tree())
+    assert_same(tree(), load_tree(path))
+    generator = np.random.default_rng()
+    generator.bit_generator.state = load_tree(path)["rng"]
+    assert generator.random() == np.random.default_rng(3).random()
+
+
+def test_equal_trees_are_equal_files(tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        save_tree(tmp_path / name, tree())
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+
+
+def test_a_missing_or_foreign_file_is_damaged(tmp_path: Path) -> None:
+    for name, content in {"empty": b"", "text": b"hello", "zeros": bytes(200), "pickle": b"\x80\x04N."}.items():
+        (tmp_path / name).write_bytes(content)
+    for name in ("empty", "text", "zeros", "pickle", "absent"):
+        with pytest.raises(files.DamagedFileError, match=f"{name}: is no checkpoint"):
+            load_tree(tmp_path / name)
+
+
+def test_weights_without_a_tree_are_no_checkpoint(tmp_path: Path) -> None:
+    import safetensors.numpy
+
+    safetensors.numpy.save_file({"a": np.ones(2)}, tmp_path / "f")
+    with pytest.raises(files.DamagedFileError, match="is no checkpoint"):
+        load_tree(tmp_path / "f")
+
+
+def test_every_cut_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    save_tree(path, tree())
+    data = path.read_bytes()
+    for length in {0, 1, 7, 8, 9, len(data) - 1, *random.Random(1).sample(range(len(data)), 100)}:
+        path.write_bytes(data[:length])
+        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: is no checkpoint"):
+            load_tree(path)
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    save_tree(path, tree())
+    data = path.read_bytes()
+    for bit in random.Random(2).sample(range(8 * len(data)), 500):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: is no checkpoint"):
+            load_tree(path)
+
+
+def test_what_cannot_be_saved_leaves_the_former_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    save_tree(path, {"a": 1})
+    with pytest.raises(TypeError):
+        save_tree(path, {"a": object()})
+    assert load_tree(path) == {"a": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
