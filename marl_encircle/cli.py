@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch as th
 import typer
 from rich.console import Console
 from rich.live import Live
@@ -18,7 +19,7 @@ from rich.table import Table
 
 from marl_encircle import files
 from marl_encircle.core.simulator import PlacementError
-from marl_encircle.experiments.build import Engine, load_run
+from marl_encircle.experiments.build import Engine, load_run, read_record
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import PACKAGE, Config, Profile, difference, load_config, reward_names
 from marl_encircle.experiments.evaluate import play_rounds
@@ -58,6 +59,7 @@ def _options(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
 ) -> None:
     """Keep what concerns every command."""
+    th.set_num_threads(1)  # results are promised per thread count
     os.environ["MARL_ENCIRCLE_DEBUG"] = "1" if debug else ""
 
 
@@ -92,15 +94,20 @@ def train_command(
         progress_bar=not quiet,
         tensorboard=tensorboard,
     )
+    diverged = read_record(folder).get("status") == "diverged"
     if not worked:
         typer.echo("already finished", err=True)
+    if diverged:
+        typer.echo("diverged: kept and counted as such; another seed or configuration may not", err=True)
     typer.echo(str(folder))
+    if diverged:
+        raise typer.Exit(1)
 
 
 @app.command()
 def evaluate(
     run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Rounds to play.")] = 200,
+    episodes: Annotated[int, typer.Option(min=1, max=10**6, help="Rounds to play.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Evaluation seed.")] = 1000,
     as_json: AsJson = False,
     write: Annotated[bool, typer.Option("--write", help="Replace the run's episodes.csv.")] = False,
@@ -182,7 +189,7 @@ def reproduce_tables(
     with _live() as report:
         done = reproduce(grid, out, jobs, report)
     for number in (2, 3, 4):
-        typer.echo((out / "tables" / f"table{number}.md").read_text())
+        typer.echo((out / "tables" / f"table{number}.md").read_text(encoding="utf-8"))
     typer.echo(f"trained={done.trained} evaluated={done.evaluated} reused={done.reused}")
     _exit_if_failed(done.sweep)
 
@@ -228,8 +235,8 @@ def config_show(
 def config_diff(first: str, second: str, profile: ProfileOption = "full") -> None:
     """Print what differs between two methods."""
     here, there = (load_config(name, profile=profile).to_dict() for name in (first, second))
-    for line in difference(here, there):
-        typer.echo(line.replace(" here", f" in {first}").replace(" there", f" in {second}"))
+    for line in difference(here, there, (f"in {first}", f"in {second}")):
+        typer.echo(line)
 
 
 @config_app.command("validate")

@@ -15,7 +15,14 @@ from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
-from marl_encircle.experiments.config import AlgorithmConfig, Config, Profile, Schedule, load_config
+from marl_encircle.experiments.config import (
+    MAX_POLICY_BYTES,
+    AlgorithmConfig,
+    Config,
+    Profile,
+    Schedule,
+    load_config,
+)
 from marl_encircle.maddpg import MADDPG, MATD3
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -23,8 +30,6 @@ Engine = Literal["native", "supersuit"]
 
 ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3}
 """Algorithms by the ``name`` in their configuration."""
-
-MAX_POLICY_BYTES = 1 << 26
 
 
 def make_vec_env(

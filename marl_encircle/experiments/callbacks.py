@@ -36,7 +36,7 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
 
 
 class Diverged(Exception):  # noqa: N818 - a result, not a fault of the program
-    """A loss is no finite number any more."""
+    """A loss or a weight is no finite number any more."""
 
 
 @contextmanager
@@ -66,27 +66,38 @@ def ended_rounds(callback: BaseCallback, curriculum: CurriculumVecEnv) -> list[d
 
 
 class RoundLogger(BaseCallback):
-    """Log the means of the figures of the rounds that ended since the last dump."""
+    """Log the means of the figures of the rounds that ended since the last dump.
+
+    ``rounds/length`` is over all of them, ``rounds/mean_episode_length`` (MEL) over those that succeeded.
+    """
+
+    model: MADDPG
 
     def __init__(self, curriculum: CurriculumVecEnv) -> None:
         super().__init__()
         self.curriculum = curriculum
         self._started = self._update_started = time.perf_counter()
-        self._world_steps = 0
+        self._world_steps = self._updates = 0
 
     def _on_training_start(self) -> None:
         self._started, self._world_steps = time.perf_counter(), self.curriculum.world_steps
+        self._updates = self.model._n_updates
 
     def _on_rollout_start(self) -> None:
-        self.logger.record_mean("time/update_ms", 1000 * (time.perf_counter() - self._update_started))
+        updates = self.model._n_updates - self._updates
+        if updates:
+            elapsed = time.perf_counter() - self._update_started
+            self.logger.record_mean("time/update_ms", 1000 * elapsed / updates)
 
     def _on_rollout_end(self) -> None:
-        self._update_started = time.perf_counter()
+        self._update_started, self._updates = time.perf_counter(), self.model._n_updates
 
     def _on_step(self) -> bool:
         for info in ended_rounds(self, self.curriculum):
             for name, value in info["round"].items():
                 self.logger.record_mean(name if "/" in name else f"rounds/{name}", value)
+            if info["is_success"]:
+                self.logger.record_mean("rounds/mean_episode_length", info["round"]["length"])
         for name, value in self.curriculum.difficulty.items():
             self.logger.record(f"curriculum/{name}", value)
         elapsed = time.perf_counter() - self._started
@@ -133,6 +144,10 @@ class LearningCurve(BaseCallback):
         for name, value in zip(self.COLUMNS[1:], row[1:], strict=True):
             if value is not None:
                 self.logger.record(f"eval/{name}", value)
+        self.write()
+
+    def write(self) -> None:
+        """Write the curve so far, even if it has no points yet."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.COLUMNS)
@@ -165,16 +180,24 @@ class Checkpointer(BaseCallback):
 
 
 class DivergenceGuard(BaseCallback):
-    """End the training when a loss is no finite number any more."""
+    """End the training when a loss or a weight of the actors is no finite number any more."""
+
+    model: MADDPG
 
     def _on_rollout_start(self) -> None:
+        self.check()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def check(self) -> None:
+        """Raise Diverged unless all is well."""
         for name in ("train/critic_loss", "train/actor_loss"):
             value = self.logger.name_to_value.get(name, 0.0)
             if not math.isfinite(value):
                 raise Diverged(f"{name} is {value}")
-
-    def _on_step(self) -> bool:
-        return True
+        if not all(bool(weights.isfinite().all()) for weights in self.model.actor.parameters()):
+            raise Diverged("the actors have weights that are not finite")
 
 
 class ProgressBar(BaseCallback):

@@ -9,8 +9,10 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,6 +20,7 @@ from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import Reward, nearest
 from marl_encircle.core.scenario import Scenario
+from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml, read_yaml
 
 PACKAGE = Path(__file__).parent.parent
@@ -25,11 +28,29 @@ PACKAGE = Path(__file__).parent.parent
 Profile = Literal["full", "smoke"]
 Count = Annotated[int, Field(ge=1, le=10**10)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Episodes = Annotated[int, Field(ge=1, le=10**6)]
+
+MAX_POLICY_BYTES = 1 << 26
+"""Largest ``policy.safetensors`` that is read back."""
+
+MAX_BASES = 20
 
 
 def _even(value: int) -> int:
     if value % 2:
         raise ValueError("must be even")
+    return value
+
+
+def _as_floats(value: Any) -> Any:
+    """1 and 1.0 are one weight, and one hash."""
+    if isinstance(value, dict):
+        return {key: _as_floats(inner) for key, inner in value.items()}
+    if isinstance(value, int) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError as error:
+            raise ValueError("a number is too large") from error
     return value
 
 
@@ -46,7 +67,7 @@ class RewardConfig(Section):
     closure: Closure = "all"
     two_stage: bool = True
     scale: float = 0.05
-    terms: dict[str, Any]
+    terms: Annotated[dict[str, Any], AfterValidator(_as_floats)]
 
     def build(self) -> Reward:
         """Return the reward."""
@@ -104,9 +125,9 @@ class TrainingConfig(Section):
 class EvaluationConfig(Section):
     """Which rounds are played at the end of a training and for its learning curve."""
 
-    episodes: Count
+    episodes: Episodes
     seed: Annotated[int, Field(ge=0, lt=1 << 63)]
-    curve_episodes: Count
+    curve_episodes: Episodes
     curve_seed: Annotated[int, Field(ge=0, lt=1 << 63)]
     n_directions: Annotated[int, Field(ge=8, le=4096), AfterValidator(_even)]
 
@@ -134,8 +155,10 @@ class Config(Section):
 
         :raises ConfigError: naming what is wrong
         """
-        sections = {key: value for key, value in values.items() if key != "scenario"}
-        return _checked(_build_scenario(values.get("scenario") or {}), sections)
+        scenario = values.get("scenario", {}) if isinstance(values, Mapping) else None
+        if not isinstance(scenario, Mapping):
+            raise ConfigError(f"a configuration and its scenario must be mappings; got {values!r:.80}")
+        return _checked(_build_scenario(scenario), {key: value for key, value in values.items() if key != "scenario"})
 
     @property
     def hash(self) -> str:
@@ -143,10 +166,10 @@ class Config(Section):
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
     @property
-    def run_folder(self) -> Path:
-        """``<method>/ratio<lambda>_n<n>_m<m>_<scene>``."""
+    def cell(self) -> Cell:
+        """Method and setting: which cell of the tables a run belongs to."""
         s = self.scenario
-        return Path(self.reward.name) / f"ratio{s.speed_ratio:g}_n{s.pursuers}_m{s.obstacles}_{s.scene}"
+        return Cell(self.reward.name, Setting(s.speed_ratio, s.pursuers, s.obstacles, s.scene))
 
 
 def load_config(
@@ -190,11 +213,16 @@ def reward_names() -> list[str]:
     return sorted(path.stem for folder in _reward_folders() for path in folder.glob("*.yaml"))
 
 
-def difference(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
-    """Return one line for each key whose value differs between two resolved configurations."""
+def difference(
+    here: Mapping[str, Any], there: Mapping[str, Any], where: tuple[str, str] = ("here", "there")
+) -> list[str]:
+    """Return one line for each key whose value differs between two resolved configurations.
+
+    :param where: what to call the two
+    """
     mine, other = dict(_flat(here)), dict(_flat(there))
     return [
-        f"{key}: {mine.get(key, 'missing')} here, {other.get(key, 'missing')} there"
+        f"{key}: {mine.get(key, 'missing')} {where[0]}, {other.get(key, 'missing')} {where[1]}"
         for key in dict.fromkeys([*mine, *other])
         if mine.get(key, "missing") != other.get(key, "missing")
     ]
@@ -206,32 +234,43 @@ def _reward_folders() -> list[Path]:
     return [root / name for name in ("ablations", "baselines") for root in roots if (root / name).is_dir()]
 
 
-def _is_path(name: str) -> bool:
+def is_path(name: str) -> bool:
+    """Whether a configuration is given by the path of its file, not by name."""
     return name.endswith((".yaml", ".yml")) or os.sep in name
 
 
 def _reward(name: str) -> dict[str, Any]:
-    section = _load(name, _reward_folders(), "reward")
+    folders = _reward_folders()
+    section = _load(find_file(name, folders, "reward"), folders, "reward")
     return {"name": Path(name).stem, **section}
 
 
 def _section(section: str, name: str) -> dict[str, Any]:
-    return _load(name, [PACKAGE / "configs" / section], section)
+    folders = [PACKAGE / "configs" / section]
+    return _load(find_file(name, folders, section), folders, section)
 
 
-def _load(name: str, folders: Iterable[Path], kind: str, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Read the file of that name or path, on top of its base's."""
-    path = find_file(name, folders, kind)
-    if path.resolve() in seen:
+def _load(path: Path, folders: Iterable[Path], kind: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read a file on top of its base's."""
+    real = os.path.realpath(path)
+    if real in seen:
         raise ConfigError(f"{path}: its base leads back to itself")
+    if len(seen) > MAX_BASES:
+        raise ConfigError(f"{path}: more than {MAX_BASES} bases on top of each other")
     values = read_yaml(path)
     base = values.pop("base", None)
     if base is None:
         return values
-    if not isinstance(base, str):
+    if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
         raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
-    base = str(path.parent / base) if _is_path(base) else base
-    return merge(_load(base, folders, kind, (*seen, path.resolve())), values)
+    try:
+        below = path.parent / base if is_path(base) else find_file(base, folders, kind)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: base: {error}") from error
+    inherited = _load(below, folders, kind, (*seen, real))
+    if kind == "reward":  # a changed method is another one: without a name of its own, its file's
+        inherited.pop("name", None)
+    return merge(inherited, values)
 
 
 def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
@@ -239,7 +278,7 @@ def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
 
     :raises ConfigError: naming the nearest name
     """
-    if _is_path(name):
+    if is_path(name):
         return Path(name)
     known = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
     if name not in known:
@@ -255,7 +294,7 @@ def _parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
         if not separator or len(keys) < 2 or not all(keys):
             raise ConfigError(f"--set {override:.80}: must be section.key=value")
         if keys[0] not in Config.model_fields:
-            raise ConfigError(f"--set {override:.80}: unknown section {keys[0]}{nearest(keys[0], Config.model_fields)}")
+            raise ConfigError(f"--set {override:.80}: unknown section{nearest(keys[0], Config.model_fields)}")
         try:
             value = parse_yaml(text)
         except ConfigError as error:
@@ -272,10 +311,11 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
         config = Config(scenario=scenario, **sections)
         config.reward.build()
     except ValidationError as error:
-        raise ConfigError(_explain(error)) from error
+        raise ConfigError("\n".join(explain(error, Config))) from error
     except ValueError as error:
         raise ConfigError(f"reward.{error}") from error
     _check_curriculum(config)
+    _check_networks(config)
     return config
 
 
@@ -289,30 +329,40 @@ def _build_scenario(values: Mapping[str, Any]) -> Scenario:
         return Scenario(**{**values, "observe_extras": tuple(extras) if isinstance(extras, list) else extras})
     except ValueError as error:
         raise ConfigError(f"scenario.{error}") from error
+    except OverflowError as error:
+        raise ConfigError("scenario: the bodies cover more of the scene than a number can tell") from error
 
 
-def _explain(error: ValidationError) -> str:
-    """Return one line for each thing that is wrong, with its key path, value and what is allowed."""
+def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
+    """Return one line for each thing that is wrong, with its key path, value and what is allowed.
+
+    :param model: what was to be built
+    """
     lines = []
     for item in error.errors():
-        path = ".".join(str(part) for part in item["loc"] if part != "[key]")
+        path = ".".join(f"{part!s:.80}" for part in item["loc"] if part != "[key]")
         if item["type"] == "extra_forbidden":
-            siblings = _known_keys(item["loc"][:-1])
+            siblings = _known_keys(model, item["loc"][:-1])
             lines.append(f"{path:.200}: unknown key{nearest(str(item['loc'][-1]), siblings)}")
         elif item["type"] == "missing":
             lines.append(f"{path}: missing")
         else:
             reason = item["msg"].removeprefix("Value error, ")
             lines.append(f"{path:.200}: {reason[:1].lower()}{reason[1:]}; got {item['input']!r:.80}")
-    return "\n".join(lines)
+    return lines
 
 
-def _known_keys(path: tuple[int | str, ...]) -> list[str]:
-    model: Any = Config
+def _known_keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the section at a path."""
+    annotation: Any = model
     for part in path:
-        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else Ramp
-        model = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else Ramp
-    return list(model.model_fields)
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel) and isinstance(part, str):
+            annotation = annotation.model_fields[part].annotation
+        else:  # an entry of a list or dictionary of sections, or None
+            inner = [each for each in get_args(annotation) if each not in (str, NoneType)]
+            annotation = inner[-1]
+    sections = [each for each in (annotation, *get_args(annotation)) if isinstance(each, type)]
+    return [name for each in sections if issubclass(each, BaseModel) for name in each.model_fields]
 
 
 def _check_curriculum(config: Config) -> None:
@@ -324,10 +374,31 @@ def _check_curriculum(config: Config) -> None:
                 raise ConfigError(f"training.curriculum.{name}.start: {error}") from error
 
 
+def _check_networks(config: Config) -> None:
+    """Refuse networks so large that the policy could not be read back, or that nobody wants to allocate."""
+    a, n = config.algorithm, config.scenario.pursuers
+    joint = n * (_observation_size(config) + 2)
+    actor = n * _weights([_observation_size(config), *a.net_arch, 2])
+    critics = n * _weights([joint, *a.net_arch, 1]) if a.critic == "per_agent" else _weights([joint, *a.net_arch, n])
+    for role, weights, limit in (("actors", actor, MAX_POLICY_BYTES // 2), ("critics", critics, 1 << 29)):
+        if 4 * weights > limit:
+            raise ConfigError(
+                f"algorithm.net_arch: the {role} would have {4 * weights / 1e6:.0f} MB of weights; "
+                f"at most {limit / 1e6:.0f} MB"
+            )
+
+
+def _weights(sizes: list[int]) -> int:
+    return sum((a + 1) * b for a, b in pairwise(sizes))
+
+
+def _observation_size(config: Config) -> int:
+    return int(list(layout(config.scenario).values())[-1].stop)
+
+
 def _check_memory(config: Config) -> None:
     """Refuse what cannot fit into this machine's memory: the replay buffer and the worlds."""
-    size = list(layout(config.scenario).values())[-1].stop
-    n = config.scenario.pursuers
+    n, size = config.scenario.pursuers, _observation_size(config)
     steps = min(config.algorithm.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
     needed = 4 * steps * n * (2 * size + 5) + 40 * config.training.n_worlds * config.scenario.n_directions
     installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,10 +1,11 @@
 """A grid file -> the runs it asks for: methods x settings x seeds."""
 
+from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from marl_encircle.experiments.config import PACKAGE, Config, Profile, Section, find_file, load_config
+from marl_encircle.experiments.config import PACKAGE, Config, Profile, Section, explain, find_file, is_path, load_config
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
@@ -53,7 +54,12 @@ class Job(NamedTuple):
     @property
     def config(self) -> Config:
         """The run's configuration."""
-        return load_config(self.reward, profile=self.profile, scenario=self.setting._asdict())
+        return _config(self.reward, self.setting, self.profile)
+
+
+@lru_cache(maxsize=1024)
+def _config(reward: str, setting: Setting, profile: Profile) -> Config:
+    return load_config(reward, profile=profile, scenario=setting._asdict())
 
 
 class Grid(NamedTuple):
@@ -66,36 +72,40 @@ class Grid(NamedTuple):
 def load_grid(name: str) -> Grid:
     """Return the runs of a grid in the file's order, each once, none of a cell that shares another's.
 
-    :param name: a name in ``configs/paper/`` or the path of a YAML file
+    :param name: a name in ``configs/paper/`` or the path of a YAML file; paths of methods in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
     """
+    _config.cache_clear()
     path = find_file(name, [PACKAGE / "configs" / "paper"], "grid")
     try:
         grid = GridConfig(**read_yaml(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path}: {where}: {first['msg'].lower()}; got {first['input']!r:.80}") from error
-    except TypeError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, GridConfig))) from error
     jobs: dict[Job, None] = {}
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
-        for method in group.methods:
+        for method in (str(path.parent / name) if is_path(name) else name for name in group.methods):
             for setting in (Setting(**column.model_dump()) for column in group.settings):
-                owner = _owner(method, setting, grid.shared)
+                cell = _config(method, setting, grid.profile).cell
+                owner = _owner(cell, grid.shared)
                 if owner is not None:
-                    aliases[Cell(method, setting)] = Cell(owner, setting)
+                    aliases[cell] = Cell(owner, setting)
                     continue
                 jobs |= dict.fromkeys(Job(method, setting, seed, grid.profile) for seed in group.seeds)
-    for job in {(job.reward, job.setting): job for job in jobs}.values():
-        job.config  # noqa: B018 - raises where it is not allowed
+    owners: dict[Cell, str] = {}
+    for job in jobs:
+        reward = owners.setdefault(job.config.cell, job.reward)
+        if reward != job.reward:
+            raise ConfigError(f"{path}: the methods {reward} and {job.reward} have one name, {job.config.reward.name}")
+    for cell, shared in aliases.items():
+        if shared not in owners:
+            raise ConfigError(f"{path}: shared: {cell.method} has the runs of {shared.method}, which the grid lacks")
     return Grid(tuple(jobs), aliases)
 
 
-def _owner(method: str, setting: Setting, shared: list[Shared]) -> str | None:
+def _owner(cell: Cell, shared: list[Shared]) -> str | None:
     for entry in shared:
-        if entry.method == method and entry.obstacles == setting.obstacles:
+        if entry.method == cell.method and entry.obstacles == cell.setting.obstacles:
             return entry.runs_of
     return None
 

@@ -31,6 +31,8 @@ def reproduce(
 ) -> Reproduction:
     """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
 
+    A run whose rounds had to be played again counts as evaluated, not as reused.
+
     :raises ConfigError: for a grid that is not allowed
     :raises DamagedFileError: if a run there is not what its record says
     """
@@ -48,7 +50,7 @@ def reproduce(
                 evaluated += 1
     write_tables(grid, results)
     trained = progress.done + progress.diverged - progress.reused
-    return Reproduction(trained, evaluated, progress.reused, progress)
+    return Reproduction(trained, evaluated, progress.reused - evaluated, progress)
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:
@@ -56,8 +58,8 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
 
     :return: the files written
     """
-    asked = {(job.reward, job.setting, job.seed) for job in grid.jobs}
-    runs = [run for run in read_runs(Path(results) / "runs") if (run.cell.method, run.cell.setting, run.seed) in asked]
+    asked = {(job.config.cell, job.seed) for job in grid.jobs}
+    runs = [run for run in read_runs(Path(results) / "runs") if (run.cell, run.seed) in asked]
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS})
     texts |= render_tables(runs, grid.aliases)
     folder = Path(results) / "tables"

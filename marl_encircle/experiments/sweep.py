@@ -1,11 +1,13 @@
 """Many runs, each a single-threaded process of its own; whatever stops a sweep, the next one goes on from there."""
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,7 +110,16 @@ def _start(job: Job, out: str | Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "marl_encircle.cli", "train", *arguments(job), "--out", str(out), "--quiet"]
     # A group of its own: Ctrl-C reaches the sweep alone, which then stops its workers in order.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, start_new_session=True)
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_die_with_parent
+    )
+
+
+def _die_with_parent() -> None:
+    """Have the kernel kill this process when the sweep is killed, so that the next sweep finds the folder free."""
+    if sys.platform == "linux":
+        pr_set_pdeathsig = 1
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
 
 
 def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
@@ -116,10 +127,12 @@ def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
     for process in processes:
         process.send_signal(signal.SIGTERM)
     deadline = time.monotonic() + GRACE_SECONDS
-    for process in processes:
-        try:
-            process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
+    try:
+        for process in processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+    finally:  # also after a second Ctrl-C
+        for process in processes:
             process.kill()
             process.wait()
 

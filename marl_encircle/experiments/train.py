@@ -19,6 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, configure
 
 from marl_encircle import files
+from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint
 from marl_encircle.experiments.build import Engine, build_model, build_vec_env, config_of, policy_bytes, read_record
@@ -33,7 +34,7 @@ from marl_encircle.experiments.callbacks import (
 )
 from marl_encircle.experiments.config import PACKAGE, Config, difference
 from marl_encircle.experiments.evaluate import play_rounds
-from marl_encircle.experiments.records import Episode, episodes_to_csv
+from marl_encircle.experiments.records import Episode, episodes_to_csv, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1
@@ -47,7 +48,7 @@ class OtherRunError(ConfigError):
 
 def run_folder(config: Config, seed: int, out: str | Path) -> Path:
     """Return ``OUT/<method>/ratio<lambda>_n<n>_m<m>_<scene>/seed<seed>``."""
-    return Path(out) / config.run_folder / f"seed{seed}"
+    return Path(out) / run_path(config.cell, seed)
 
 
 def train(
@@ -69,6 +70,7 @@ def train(
     :param tensorboard: write event files into the run folder
     :return: the run folder, and whether anything was left to do
     :raises OtherRunError: if the folder holds a run of another configuration or engine, with the difference
+    :raises PlacementError: if the bodies cannot be placed, before anything is written
     :raises Stopped: after SIGINT or SIGTERM, with a checkpoint written
     """
     folder = run_folder(config, seed, out)
@@ -76,7 +78,11 @@ def train(
         check_same_run(folder, config, seed, engine)
         return folder, False
     plan = _plan(config, seed, engine)
+    _check_placement(config)
     with files.folder_lock(folder):
+        if (folder / "run.json").exists():  # by whoever had the lock until now
+            check_same_run(folder, config, seed, engine)
+            return folder, False
         th.set_num_threads(1)
         _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard)
     return folder, True
@@ -92,14 +98,17 @@ class _Run:
         path = folder / checkpoint.NAME
         saved = checkpoint.load_tree(path) if path.exists() else None
         if saved is not None:
-            _check_same(folder, plan, saved["plan"])
+            _check_same(folder, plan, saved.get("plan", {}))
         self.env = build_vec_env(config, config.training.n_worlds, engine)
         self.curriculum = cast(CurriculumVecEnv, self.env.venv)  # type: ignore[attr-defined]
         self.model = build_model(config, self.env, seed)
         if saved is not None:
-            checkpoint.restore(self.model, self.curriculum, saved["training"])
-            self.wall_seconds, self.cpu_seconds = saved["seconds"]
-            self.rows = saved["rows"]
+            try:
+                checkpoint.restore(self.model, self.curriculum, saved["training"])
+                self.wall_seconds, self.cpu_seconds = saved["seconds"]
+                self.rows = saved["rows"]
+            except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+                raise files.DamagedFileError(path, f"does not fit this training: {str(error)[:200]}") from error
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
     def play(self, checkpoint_every: float, progress_bar: bool, tensorboard: bool) -> None:
@@ -108,7 +117,8 @@ class _Run:
         folder = self.folder / "tensorboard"
         model.set_logger(configure(str(folder), ["tensorboard"]) if tensorboard else Logger(None, []))
         curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows)
-        callbacks: list[BaseCallback] = [RoundLogger(curriculum), DivergenceGuard(), curve]
+        guard = DivergenceGuard()
+        callbacks: list[BaseCallback] = [RoundLogger(curriculum), guard, curve]
         bar = ProgressBar(curriculum, total)
         if progress_bar:
             callbacks.append(bar)
@@ -122,11 +132,17 @@ class _Run:
                     log_interval=ROUNDS_PER_LOG,
                     reset_num_timesteps=not curriculum.world_steps,
                 )
+                guard.check()
                 curve.add_point()
             except Diverged:
                 status = "diverged"
+            else:
+                model.dump_logs()
             finally:
                 bar.close()
+                model.logger.close()
+                self.env.close()
+        curve.write()
         self.record(status)
 
     def save_checkpoint(self) -> None:
@@ -154,15 +170,16 @@ class _Run:
             contents["episodes.csv"] = episodes_to_csv(episodes).encode()
         for name, data in contents.items():
             files.write_bytes(self.folder / name, data)
-        if (self.folder / "progress.csv").exists():
-            contents["progress.csv"] = (self.folder / "progress.csv").read_bytes()
+        contents["progress.csv"] = (self.folder / "progress.csv").read_bytes()
         record = {
             "schema": SCHEMA,
             "status": status,
             "method": self.config.reward.name,
-            **self.plan,
+            "config": self.plan["config"],
             "config_hash": self.config.hash,
             "source_hash": source_hash(),
+            "seed": self.plan["seed"],
+            "engine": self.plan["engine"],
             "git_commit": git_commit(),
             "versions": versions(),
             "cpu": cpu_model(),
@@ -195,6 +212,8 @@ def source_hash() -> str:
 
 def git_commit() -> str | None:
     """Return the commit of the checkout that the package runs from, ``-dirty`` if it has changes; else None."""
+    if not (PACKAGE.parent / ".git").exists():  # else that of a repository around an installation
+        return None
     command = ["git", "-C", str(PACKAGE), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
@@ -221,6 +240,15 @@ def cpu_model() -> str:
 def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:
     """Raise an OtherRunError unless the finished run in ``folder`` is of this configuration, seed and engine."""
     _check_same(folder, _plan(config, seed, engine), read_record(folder))
+
+
+def _check_placement(config: Config) -> None:
+    """Place the bodies once at the first and at the final difficulty; raise a PlacementError where they do not fit."""
+    first = {name: ramp.start for name, ramp in config.training.curriculum.items() if ramp is not None}
+    for difficulty in (first, {}):
+        simulator = Simulator(config.scenario, n_worlds=16, seed=0)
+        simulator.set_difficulty(cast(Difficulty, difficulty))
+        simulator.reset()
 
 
 def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from ruamel.yaml.events import (
 
 MAX_BYTES = 128_000
 MAX_DEPTH = 20
+MAX_VALUES = 2000
 
 
 class ConfigError(ValueError):
@@ -35,6 +36,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     :raises ConfigError: if there is no such file, it is larger than 128 kB, no YAML, no mapping, or has more in it than
         mappings, lists, strings, finite numbers, booleans and null
     """
+    if path.exists() and not path.is_file():  # what is no file may never end
+        raise ConfigError(f"{path}: is no file")
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -64,19 +67,24 @@ def parse_yaml(text: str) -> Any:
         value = yaml.load(text)
     except MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise ConfigError(f"{line}{error.problem or error.context}".splitlines()[0]) from error
+        raise ConfigError(line + _in_short(error.problem or error.context or "")) from error
     except (YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"not YAML: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from error
+        raise ConfigError(f"not YAML: {_in_short(str(error) or type(error).__name__)}") from error
     _check_plain(value, "")
     return value
+
+
+def _in_short(reason: str) -> str:
+    """First line of what ruamel says, without the values that it quotes in full."""
+    return reason.partition(" with value")[0].splitlines()[0][:120]
 
 
 def _refuse_tricks(yaml: YAML, text: str) -> None:
     """Walk over the events, which costs little, before anything is built."""
     depth = 0
-    for event in yaml.parse(text):
+    for count, event in enumerate(yaml.parse(text)):
         where = f"line {event.start_mark.line + 1}"
         if isinstance(event, AliasEvent) or getattr(event, "anchor", None):
             raise ConfigError(f"{where}: anchors and aliases are not allowed; write the value out")
@@ -88,25 +96,28 @@ def _refuse_tricks(yaml: YAML, text: str) -> None:
             raise ConfigError(f"{where}: merge keys are not allowed; use 'base:'")
         depth += isinstance(event, (MappingStartEvent, SequenceStartEvent))
         depth -= isinstance(event, (MappingEndEvent, SequenceEndEvent))
+        if count > MAX_VALUES:
+            raise ConfigError(f"{where}: more than {MAX_VALUES} values")
         if depth > MAX_DEPTH:
             raise ConfigError(f"{where}: nested more than {MAX_DEPTH} deep")
 
 
 def _check_plain(value: Any, path: str) -> None:
+    where = f"{path:.200}: " if path else ""
     if isinstance(value, dict):
         for key, inner in value.items():
             if not isinstance(key, str):
-                raise ConfigError(f"{path or 'top level'}: keys must be names; got {key!r:.80}")
+                raise ConfigError(f"{where}keys must be names; got {key!r:.80}")
             _check_plain(inner, f"{path}.{key}" if path else key)
     elif isinstance(value, list):
         for i, inner in enumerate(value):
             _check_plain(inner, f"{path}[{i}]")
     elif isinstance(value, (datetime.date, datetime.datetime)):
-        raise ConfigError(f"{path}: {value} is read as a date; put it in quotes")
+        raise ConfigError(f"{where}{value} is read as a date; put it in quotes")
     elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{path}: must be finite; got {value}")
+        raise ConfigError(f"{where}must be finite; got {value}")
     elif not isinstance(value, (str, int, float, bool, type(None))):
-        raise ConfigError(f"{path}: {value!r:.80} is no plain value")
+        raise ConfigError(f"{where}{value!r:.80} is no plain value")
 
 
 def merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,319 @@
+"""A configuration is complete and right, or refused in one line before anything is done."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml_cases
+
+from marl_encircle.experiments.config import Config, difference, load_config, reward_names
+from marl_encircle.experiments.train import run_folder
+from marl_encircle.experiments.yaml_files import ConfigError
+
+
+def refused(reward: str = "ours", **how: Any) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(reward, **how)
+    return str(caught.value)
+
+
+def write(folder: Path, name: str, text: str) -> str:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+# layers
+
+
+def test_a_field_that_nobody_names_keeps_its_default_and_the_last_one_to_name_it_wins() -> None:
+    assert load_config().scenario.safety_distance == 0.11
+    scenario = {"safety_distance": 0.12, "pursuers": 4}
+    config = load_config(
+        scenario=scenario, overrides=["scenario.safety_distance=0.13", "scenario.safety_distance=0.14"]
+    )
+    assert (config.scenario.safety_distance, config.scenario.pursuers, config.scenario.obstacles) == (0.14, 4, 1)
+
+
+def test_mappings_are_merged_key_by_key_and_null_switches_off(tmp_path: Path) -> None:
+    path = write(tmp_path, "mine.yaml", "base: ours\nterms:\n  contraction: {weight: 2.0, cap: 5.0}\n  time: null\n")
+    terms = load_config(path, overrides=["reward.terms.contraction.cap=4"]).reward.terms
+    assert terms == {**load_config().reward.terms, "contraction": {"weight": 2.0, "cap": 4.0}, "time": None}
+    assert "time" not in load_config(path).reward.build().active
+
+
+def test_a_chain_of_bases_is_followed_from_file_to_file(tmp_path: Path) -> None:
+    write(tmp_path, "far/first.yaml", "base: model_b\nscale: 0.5\nterms: {time: 1.0}\n")
+    write(tmp_path, "second.yaml", "base: far/first.yaml\nterms: {time: 2.0}\n")
+    third = write(tmp_path, "near/third.yaml", "base: ../second.yaml\nname: third\n")
+    reward = load_config(third).reward
+    assert (reward.name, reward.scale, reward.two_stage, reward.terms["time"]) == ("third", 0.5, False, 2.0)
+    assert reward.terms["completion"] == 50.0
+
+
+def test_a_base_that_leads_back_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, "a.yaml", "base: b.yaml\n")
+    path = write(tmp_path, "b.yaml", "base: a.yaml\n")
+    assert refused(path).endswith("its base leads back to itself")
+    assert refused(write(tmp_path, "c.yaml", "base: ./c.yaml\n")).endswith("its base leads back to itself")
+    (tmp_path / "link.yaml").symlink_to(tmp_path / "link.yaml")
+    assert "cannot be read" in refused(str(tmp_path / "link.yaml"))
+
+
+def test_bases_do_not_go_on_for_ever(tmp_path: Path) -> None:
+    for i in range(30):
+        write(tmp_path, f"{i}.yaml", f"base: {i + 1}.yaml\n")
+    assert "more than 20 bases" in refused(str(tmp_path / "0.yaml"))
+
+
+def test_a_changed_method_has_its_own_name_or_its_files_never_its_bases(tmp_path: Path) -> None:
+    assert load_config(write(tmp_path, "bold.yaml", "base: ours\nscale: 1.0\n")).reward.name == "bold"
+    assert load_config(write(tmp_path, "bolder.yaml", "base: bold.yaml\n")).reward.name == "bolder"
+    assert load_config(write(tmp_path, "x.yaml", "base: bold.yaml\nname: said\n")).reward.name == "said"
+
+
+def test_a_users_file_works_where_a_name_does_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path, "elsewhere/mine.yaml", "base: ours\nname: ours\n")
+    monkeypatch.chdir(tmp_path)
+    for path in ("elsewhere/mine.yaml", "./elsewhere/mine.yaml", str(tmp_path / "elsewhere" / "mine.yaml")):
+        assert load_config(path) == load_config("ours")
+    algorithm = write(tmp_path, "slow.yml", "base: maddpg\nlearning_rate: 1e-4\n")
+    assert load_config(algorithm=algorithm).algorithm.learning_rate == 1e-4
+
+
+def test_the_installation_knows_the_papers_methods() -> None:
+    assert reward_names() == ["ma2019", "model_a", "model_b", "model_c", "ours"]
+    assert load_config(algorithm="matd3").algorithm.name == "matd3"
+
+
+@pytest.mark.parametrize(
+    ("ratio", "pursuers", "alone"),
+    # Eq. 6: the least n is 3, 4, 4, 4 for 1.1, 1.2, 1.3, 1.4
+    [(1.1, 2, False), (1.1, 3, True), *((r, n, n == 4) for r in (1.2, 1.3, 1.4) for n in (3, 4))],
+)
+@pytest.mark.parametrize("profile", ["full", "smoke"])
+def test_the_curriculum_follows_from_eq_6_for_every_method_alike(
+    ratio: float, pursuers: int, alone: bool, profile: Any
+) -> None:
+    for method in ("ours", "model_a", "ma2019"):
+        config = load_config(method, profile=profile, scenario={"speed_ratio": ratio, "pursuers": pursuers})
+        ramps = {name for name, ramp in config.training.curriculum.items() if ramp is not None}
+        assert ramps == ({"safety_distance"} if alone else {"obstacle_radius", "speed_ratio"})
+        longer = config.training.world_steps > 1_000_000
+        assert longer == (profile == "full" and not alone)
+
+
+# one run, one folder, one hash
+
+
+def test_a_runs_folder_tells_method_and_setting_exactly() -> None:
+    def folder(**scenario: Any) -> str:
+        return str(run_folder(load_config("model_b", scenario=scenario), 7, "out"))
+
+    assert folder() == "out/model_b/ratio1.1_n3_m1_random/seed7"
+    assert folder(speed_ratio=1, obstacles=0) == "out/model_b/ratio1.0_n3_m0_random/seed7"
+    assert folder(speed_ratio=1.123456789, scene="tunnel") == "out/model_b/ratio1.123456789_n3_m1_tunnel/seed7"
+
+
+def leaves(values: Any, path: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], Any]]:
+    if isinstance(values, dict) and values:
+        return [leaf for key, inner in values.items() for leaf in leaves(inner, (*path, key))]
+    return [(path, values)]
+
+
+def test_the_hash_changes_with_every_value_and_with_nothing_else() -> None:
+    values = load_config().to_dict()
+    hashes = {load_config().hash}
+    for path, value in leaves(values):
+        changed = json.loads(json.dumps(values))
+        place = changed
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = other(path[-1], value)
+        hashes.add(Config.from_dict(changed).hash)
+    assert len(hashes) == 1 + len(leaves(values))
+    assert len(leaves(values)) > 60
+    backwards = dict(reversed(values.items()))
+    assert Config.from_dict(backwards).hash == load_config().hash
+    same = ["reward.terms.time=8", "scenario.speed_ratio=1.10", "training.n_worlds=64"]
+    assert load_config(overrides=same).hash == load_config().hash
+
+
+def other(key: str, value: Any) -> Any:
+    """A different value that is allowed."""
+    names = {
+        "name": "matd3" if value == "maddpg" else "else",
+        "closure": "pursuers",
+        "critic": "per_agent",
+        "scene": "tunnel",
+        "dynamics": "first_order",
+        "integration": "mpe2",
+        "contacts": "off",
+        "turn_order": "simultaneous",
+        "target": "still",
+        "repulsion_from": "surface",
+        "path_rule": "relaxed",
+        "placement": "overlapping",
+        "net_arch": [32],
+        "observe_extras": ["stage"],
+        "max_grad_norm": 1.0,
+        "repulsion_power": 1,
+    }
+    if key in names:
+        return names[key]
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + 2
+    return value * 0.9 + 0.0007 if key != "speed_ratio" else 1.2
+
+
+def test_a_configuration_comes_back_from_its_plain_data() -> None:
+    for method in reward_names():
+        config = load_config(method, overrides=["scenario.observe_extras=[stage, speed_ratio]"])
+        again = Config.from_dict(json.loads(json.dumps(config.to_dict())))
+        assert again == config
+        assert (again.hash, again.to_dict()) == (config.hash, config.to_dict())
+
+
+@pytest.mark.parametrize(
+    "values", [None, [], "x", {}, {"scenario": [1]}, {"scenario": {"pursuer": 1}}, {"reward": 3, "scenario": {}}]
+)
+def test_plain_data_of_something_else_is_refused(values: Any) -> None:
+    with pytest.raises(ConfigError):
+        Config.from_dict(values)
+
+
+def test_a_difference_names_every_key_that_differs_and_no_other() -> None:
+    here = load_config("ours").to_dict()
+    there = load_config("model_a", overrides=["training.curriculum.safety_distance=null"]).to_dict()
+    assert difference(here, here) == []
+    assert difference(here, there) == [
+        "reward.name: ours here, model_a there",
+        "reward.closure: all here, pursuers there",
+        "reward.terms.obstacle_angle: 0.5 here, None there",
+        "training.curriculum.safety_distance.start: 0.3 here, missing there",
+        "training.curriculum.safety_distance.world_steps: 300000 here, missing there",
+        "training.curriculum.safety_distance: missing here, None there",
+    ]
+    assert difference({"a": 1}, {}, ("left", "right")) == ["a: 1 left, missing right"]
+
+
+# the paper's methods
+
+
+def test_the_methods_are_those_of_the_notes() -> None:
+    ours = load_config("ours").reward
+    both, pursuers = "all", "pursuers"
+    terms = {"overall_angle", "contributing_angle", "obstacle_angle", "contraction", "collision", "completion", "time"}
+    expected = {
+        "ours": (both, True, terms),
+        "model_a": (pursuers, True, terms - {"obstacle_angle"}),
+        "model_b": (both, False, terms),
+        "model_c": (both, True, terms - {"contributing_angle"}),
+        "ma2019": (pursuers, False, {"encirclement_radius", "phase_difference", "collision", "completion", "time"}),
+    }
+    assert sorted(expected) == reward_names()
+    for method, (closure, two_stage, names) in expected.items():
+        reward = load_config(method).reward
+        active = reward.build().active
+        assert (reward.name, reward.closure, reward.two_stage) == (method, closure, two_stage)
+        assert active.keys() == names
+        assert reward.scale == ours.scale
+        for name in names & terms:
+            assert active[name] == ours.build().active[name], (method, name)
+    assert load_config("ma2019").reward.build().active["encirclement_radius"][1] == {"radius": 0.15}
+
+
+def test_methods_differ_in_their_reward_only() -> None:
+    for method in reward_names():
+        here, there = load_config(method).to_dict(), load_config("ours").to_dict()
+        assert all(line.startswith("reward.") for line in difference(here, there))
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(("text", "reason"), yaml_cases.REWARD_FILES)
+def test_a_bad_file_is_refused_by_name_and_reason(tmp_path: Path, text: str | bytes, reason: str) -> None:
+    path = tmp_path / "case.yaml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    message = refused(str(path))
+    assert reason in message
+    assert message.startswith((str(tmp_path), "reward."))
+    assert_short(message.replace(str(path), ""))
+
+
+@pytest.mark.parametrize(("override", "reason"), yaml_cases.OVERRIDES)
+def test_a_bad_override_is_refused_by_key_and_reason(override: str, reason: str) -> None:
+    message = refused(overrides=[override])
+    assert reason in message
+    assert_short(message)
+
+
+@pytest.mark.parametrize(("how", "reason"), yaml_cases.ARGUMENTS)
+def test_a_bad_name_or_setting_is_refused(how: dict[str, Any], reason: str) -> None:
+    message = refused(**how)
+    assert reason in message
+    assert_short(message)
+
+
+def assert_short(message: str) -> None:
+    """One line a fault, none with a long value in it."""
+    for line in message.splitlines():
+        assert len(line) < 800
+        assert "x" * 81 not in line
+        assert "9" * 81 not in line
+
+
+def test_there_are_many_cases() -> None:
+    assert len(yaml_cases.REWARD_FILES) + len(yaml_cases.OVERRIDES) + len(yaml_cases.ARGUMENTS) >= 80
+
+
+def test_every_fault_of_a_file_is_told_at_once() -> None:
+    overrides = ["reward.scale=true", "training.n_worlds=0", "algorithm.gama=1"]
+    lines = refused(overrides=overrides).splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["reward.scale", "algorithm.gama", "training.n_worlds"]
+
+
+def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    assert "is no file" in refused(str(tmp_path / "folder.yaml"))
+    os.mkfifo(tmp_path / "pipe.yaml")
+    assert "is no file" in refused(str(tmp_path / "pipe.yaml"))
+    assert "No such file" in refused(str(tmp_path / "absent.yaml"))
+    assert "No such file" in refused("ablations/absent.yml")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["algorithm.buffer_world_steps=10000000000", "training.world_steps=10000000000"],
+        ["training.n_worlds=65536", "scenario.n_directions=4096", "scenario.pursuers=64", "scenario.obstacles=0",
+         "scenario.pursuer_radius=0.01", "algorithm.buffer_world_steps=1000000000", "training.world_steps=1000000000"],
+    ],
+)  # fmt: skip
+def test_what_would_not_fit_into_memory_is_refused(overrides: Sequence[str]) -> None:
+    assert "GB would be needed, this machine has" in refused(overrides=overrides)
+
+
+def test_a_buffer_is_no_larger_than_its_training() -> None:
+    load_config(profile="smoke", overrides=["algorithm.buffer_world_steps=10000000000"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "role"),
+    [
+        (["algorithm.net_arch=[4096, 4096, 4096]"], "the actors would have"),
+        (["algorithm.net_arch=[300]", "algorithm.critic=per_agent", "scenario.pursuers=64",
+          "scenario.pursuer_radius=0.01"], "the critics would have"),
+    ],
+)  # fmt: skip
+def test_networks_that_could_not_be_read_back_are_refused(overrides: Sequence[str], role: str) -> None:
+    message = refused(overrides=overrides)
+    assert "algorithm.net_arch" in message
+    assert role in message

@@ -1,0 +1,104 @@
+"""Trainings of a second or less, the command run in this process, and a training to be stopped from outside."""
+
+import atexit
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from marl_encircle.cli import main
+from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments.build import Engine
+from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.train import train
+
+TINY = (
+    "training.n_worlds=4",
+    "training.world_steps=400",
+    "training.curve_every=120",
+    "training.curriculum.safety_distance={start: 0.3, world_steps: 300}",
+    "algorithm.batch_size=32",
+    "algorithm.net_arch=[16]",
+    "algorithm.random_world_steps=60",
+    "algorithm.buffer_world_steps=240",  # is full, and overwritten, before the end
+    "evaluation.episodes=8",
+    "evaluation.curve_episodes=4",
+    "evaluation.n_directions=72",
+    "scenario.max_cycles=20",  # whose clumsy pursuers succeed now and then:
+    "scenario.movement_range_limit=0.6",
+)
+FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
+
+
+def tiny(reward: str = "ours", overrides: Sequence[str] = (), **scenario: Any) -> Config:
+    """A configuration whose training takes half a second."""
+    return load_config(reward, profile="smoke", scenario=scenario, overrides=[*TINY, *overrides])
+
+
+def tiny_arguments(*more: str) -> list[str]:
+    """The same on the command line."""
+    return ["--profile", "smoke", *(part for text in TINY for part in ("--set", text)), *more]
+
+
+@cache
+def finished(engine: Engine = "native") -> Path:
+    """A finished tiny run, to be read only."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder)
+    return train(tiny(), 0, engine, folder)[0]
+
+
+def copy_of_finished(folder: Path) -> Path:
+    """A finished tiny run to be changed, in the folder of all runs ``folder``."""
+    source = finished()
+    target = folder.joinpath(*source.parts[-3:])
+    shutil.copytree(source, target)
+    return target
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a run that are the same whenever it is trained."""
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def everything_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+class Done(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Done:
+    """Run ``marl-encircle`` in this process."""
+    monkeypatch.setenv("MARL_ENCIRCLE_DEBUG", "")
+    monkeypatch.setattr(sys, "argv", ["marl-encircle", *map(str, arguments)])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        main()
+    code = ended.value.code
+    assert isinstance(code, int)
+    return Done(code, *capsys.readouterr())
+
+
+def train_slowly(out: Path, engine: Engine, checkpoint_every: float) -> None:
+    """The tiny training, slow enough to be stopped in its midst; nothing else differs."""
+    step_wait = CurriculumVecEnv.step_wait
+
+    def slow(self: CurriculumVecEnv) -> VecEnvStepReturn:
+        time.sleep(0.01)
+        return step_wait(self)
+
+    CurriculumVecEnv.step_wait = slow  # type: ignore[method-assign]
+    train(tiny(), 0, engine, out, checkpoint_every=checkpoint_every)
