@@ -97,7 +97,7 @@ def train_slowly(out: Path, engine: Engine, checkpoint_every: float) -> None:
     step_wait = CurriculumVecEnv.step_wait
 
     def slow(self: CurriculumVecEnv) -> VecEnvStepReturn:
-        time.sleep(0.01)
+        time.sleep(0.004)
         return step_wait(self)
 
     CurriculumVecEnv.step_wait = slow  # type: ignore[method-assign]

@@ -167,13 +167,16 @@ def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, An
     record = read_record(folder)
     path = folder / "policy.safetensors"
     try:
-        config = config_of(record)
+        config = config_of(record, folder)
         data = files.read_bytes(path, sha256=record["sha256"]["policy.safetensors"], max_bytes=MAX_POLICY_BYTES)
     except (KeyError, TypeError) as error:
         raise files.DamagedFileError(folder / "run.json", f"has no {error}") from error
     policy = build_policy(config)
     try:
         tensors = safetensors.torch.load(data)
+        for name, weights in policy.actor_state_dict().items():
+            if name in tensors and tensors[name].dtype != weights.dtype:
+                raise ValueError(f"{name} has the type {tensors[name].dtype}")
         policy.actor.load_state_dict(tensors)
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
         raise files.DamagedFileError(path, f"does not hold this policy's weights: {str(error)[:200]}") from error
@@ -198,12 +201,12 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record
 
 
-def config_of(record: dict[str, Any]) -> Config:
-    """Return the configuration that a run was made with.
+def config_of(record: dict[str, Any], folder: Path) -> Config:
+    """Return the configuration that the run of a folder was made with.
 
     :raises DamagedFileError: if it is no valid configuration
     """
     try:
-        return Config.from_dict(record["config"])
+        return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
     except ValueError as error:
-        raise files.DamagedFileError("run.json", f"config: {error}") from error
+        raise files.DamagedFileError(folder / "run.json", f"config: {error}") from error

@@ -257,7 +257,7 @@ def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:
 
 def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> None:
     """Compare with what a run or a checkpoint was made with; fields that were added since have their defaults."""
-    other = _plan(config_of(record), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]
+    other = _plan(config_of(record, folder), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)

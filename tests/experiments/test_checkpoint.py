@@ -22,7 +22,7 @@ def tree() -> dict[str, Any]:
         "a": {"b/c": np.ones(2)},
         "a/b": {"c": np.zeros(2)},
         "rng": generator.bit_generator.state,
-        "numpy": list(np.random.RandomState(1).get_state()),  # noqa: NPY002 - SB3 draws from such a one
+        "numpy": list(np.random.RandomState(1).get_state()),
         "tensors": (th.full((2, 2), np.nan), th.tensor(3, dtype=th.int64), th.ones(2, dtype=th.uint8)),
         "scalars": [np.float32(0.1), np.int64(3), np.bool_(True)],
     }

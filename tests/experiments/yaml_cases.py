@@ -85,7 +85,7 @@ REWARD_FILES: list[tuple[str | bytes, str]] = [
     (f"base: ours\nterms: {{time: {LONG}}}\n", "reward.terms.time.weight must be a finite number; got 'xxx"),
     (f"base: ours\nterms: {{time: {DIGITS}}}\n", "reward.terms: a number is too large"),
     ("base: ours\nterms: {time: {}}\n", "reward.terms.time needs a weight"),
-    ("base: ours\nterms: {contraction: {weight: 1, capp: 2}}\n", "contraction.capp: unknown parameter; did you mean cap?"),
+    ("base: ours\nterms: {contraction: {weight: 1, capp: 2}}\n", "contraction.capp: unknown parameter; did you mean"),
     ("base: ours\nterms: {contraction: {weight: 1, t: 2}}\n", "contraction.t: unknown parameter"),
     ("base: ours\nterms: {contraction: {weight: 1, cap: null}}\n", "contraction.cap must be a finite number; got None"),
     ("base: ours\nterms: {contraction: {cap: 1}}\n", "reward.terms.contraction needs a weight"),

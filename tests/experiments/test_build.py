@@ -1,0 +1,229 @@
+"""What users build from names: worlds to train in, a model, and a trained policy read back."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch as th
+from stable_baselines3.common.vec_env import VecMonitor
+from tiny_runs import copy_of_finished, finished, tiny
+
+from marl_encircle import files
+from marl_encircle.core.observations import layout
+from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
+from marl_encircle.envs.vec_env import EncirclementVecEnv
+from marl_encircle.experiments.build import (
+    ALGORITHMS,
+    NoiseSchedule,
+    build_model,
+    build_vec_env,
+    load_policy,
+    load_run,
+    make_vec_env,
+    policy_bytes,
+)
+from marl_encircle.experiments.config import Schedule, load_config
+from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.maddpg import MADDPG, MATD3
+
+# worlds
+
+
+def curriculum(venv: Any) -> CurriculumVecEnv:
+    inner = venv.venv
+    assert isinstance(inner, CurriculumVecEnv)
+    return inner
+
+
+@pytest.mark.parametrize(("engine", "kind"), [("native", EncirclementVecEnv), ("supersuit", SuperSuitVecEnv)])
+def test_worlds_are_slots_under_a_monitor_with_the_settings_curriculum(engine: Any, kind: type[Any]) -> None:
+    venv = make_vec_env("model_b", 5, engine=engine, pursuers=4, obstacles=2, speed_ratio=1.2)
+    assert isinstance(venv, VecMonitor)
+    assert isinstance(venv.venv, CurriculumVecEnv)
+    assert isinstance(venv.venv.venv, kind)
+    assert (venv.num_envs, venv.n_agents) == (20, 4)
+    assert venv.venv.difficulty == pytest.approx({"safety_distance": 0.3})
+    hard = make_vec_env(n_worlds=2, engine=engine, pursuers=2)
+    assert curriculum(hard).difficulty == pytest.approx({"obstacle_radius": 0.45, "speed_ratio": 1.1})
+
+
+def test_without_a_curriculum_worlds_are_final_from_the_start() -> None:
+    venv = make_vec_env(n_worlds=2, curriculum=False, pursuers=2)
+    venv.reset()
+    assert curriculum(venv).difficulty == {}
+    state = venv.get_attr("simulator")[0].state
+    assert (state.safety_distance == 0.11).all()
+    assert (state.obstacle_radius == 0.2).all()
+
+
+def test_equal_seeds_make_equal_worlds_and_none_makes_others() -> None:
+    def first(seed: int | None, engine: Any = "native") -> np.ndarray:
+        observations = make_vec_env(n_worlds=3, seed=seed, engine=engine).reset()
+        assert isinstance(observations, np.ndarray)
+        return observations
+
+    assert np.array_equal(first(3), first(3))
+    assert np.array_equal(first(3), first(3, "supersuit"))
+    assert not np.array_equal(first(3), first(4))
+    assert not np.array_equal(first(None), first(None))
+
+
+def test_a_users_file_and_overrides_reach_the_worlds(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: ours\nterms: {time: 3.0, contraction: null}\n")
+    venv = make_vec_env(str(path), 2, overrides=["reward.scale=0.5"], max_cycles=7)
+    reward = venv.get_attr("terms")[0]
+    assert (reward.scale, reward.terms["time"], venv.get_attr("scenario")[0].max_cycles) == (0.5, 3.0, 7)
+    assert "contraction" not in reward.active
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ({"pursuer": 3}, "scenario.pursuer: unknown key; did you mean pursuers?"),
+        ({"pursuers": "3"}, "scenario.pursuers must be an integer"),
+        ({"reward": "our"}, "did you mean ours?"),
+        ({"overrides": ["training.n_world=3"]}, "did you mean n_worlds?"),
+    ],
+)
+def test_a_misspelt_argument_names_the_nearest(how: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_vec_env(**how)
+    assert reason in str(caught.value)
+
+
+def test_plain_maddpg_learns_in_these_worlds() -> None:
+    venv = make_vec_env(n_worlds=4, seed=0)
+    MADDPG("MlpPolicy", venv, learning_starts=60, batch_size=16, seed=0).learn(240)
+    assert curriculum(venv).world_steps == 80
+
+
+# models
+
+
+def test_world_steps_become_the_pursuers_steps() -> None:
+    config = load_config(scenario={"pursuers": 4}, overrides=["algorithm.buffer_world_steps=1000"])
+    model = build_model(config, build_vec_env(config, 8), 3)
+    assert model.learning_starts == 4 * 5000
+    assert model.buffer_size == 4000
+    assert model.replay_buffer is not None
+    assert model.replay_buffer.observations.shape[:2] == (125, 32)  # 125 steps of 8 worlds are 1,000 world steps
+    assert (model.n_agents, model.gamma, model.tau, model.batch_size, model.seed) == (4, 0.9, 0.01, 1024, 3)
+    assert (model.critic_kind, model.policy_delay, model.max_grad_norm) == ("shared", 2, None)
+    assert str(model.device) == "cpu"
+
+
+def test_a_buffer_is_no_larger_than_its_training() -> None:
+    config = tiny(overrides=["algorithm.buffer_world_steps=1000000"])
+    assert build_model(config, build_vec_env(config, 4), 0).buffer_size == 3 * 404
+
+
+def test_the_noise_follows_the_world_steps() -> None:
+    noise = NoiseSchedule(Schedule(start=0.4, end=0.1, world_steps=500), world_steps=2000)
+    assert noise(1.0) == pytest.approx(0.4)
+    assert noise(1 - 250 / 2000) == pytest.approx(0.25)
+    assert noise(1 - 500 / 2000) == noise(0.0) == noise(-0.1) == 0.1
+
+
+def test_the_registry_has_what_a_configuration_may_name() -> None:
+    assert ALGORITHMS == {"maddpg": MADDPG, "matd3": MATD3}
+    for name, algorithm in ALGORITHMS.items():
+        config = load_config(algorithm=name, profile="smoke")
+        assert type(build_model(config, build_vec_env(config, 2), 0)) is algorithm
+
+
+# policies
+
+
+def test_a_trained_policy_comes_back_and_acts() -> None:
+    policy = load_policy(finished())
+    size = list(layout(tiny().scenario).values())[-1].stop
+    observations = np.random.default_rng(0).uniform(-1, 1, (6, size)).astype(np.float32)
+    actions, _ = policy.predict(observations, deterministic=True)
+    assert np.asarray(actions).shape == (6, 2)
+    assert np.abs(actions).max() <= 1
+    assert policy_bytes(policy) == (finished() / "policy.safetensors").read_bytes()
+    assert not policy.training
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "matd3"])
+@pytest.mark.parametrize("critic", ["shared", "per_agent"])
+def test_equal_weights_are_equal_bytes_whatever_the_algorithm(algorithm: str, critic: str) -> None:
+    config = load_config(algorithm=algorithm, profile="smoke", overrides=[f"algorithm.critic={critic}"])
+    one, other = (policy_bytes(build_model(config, build_vec_env(config, 2), 5).policy) for _ in range(2))
+    assert one == other
+
+
+def edit_record(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    record = json.loads((folder / "run.json").read_text())
+    change(record)
+    (folder / "run.json").write_text(json.dumps(record))
+
+
+def rewrite_policy(folder: Path, change: Callable[[dict[str, th.Tensor]], object]) -> None:
+    """Change the weights and vouch for them, as someone who means ill would."""
+    path = folder / "policy.safetensors"
+    tensors = safetensors.torch.load(path.read_bytes())
+    change(tensors)
+    path.write_bytes(safetensors.torch.save(tensors))
+    edit_record(folder, lambda record: record["sha256"].update({path.name: files.sha256_file(path)}))
+
+
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no folder": (lambda f: f.rename(f.with_name("gone")), "run.json: the file is missing"),
+    "no record": (lambda f: (f / "run.json").unlink(), "run.json: the file is missing"),
+    "empty record": (write("run.json", b""), "run.json: is no JSON"),
+    "half a record": (lambda f: write("run.json", (f / "run.json").read_bytes()[:900])(f), "run.json: is no JSON"),
+    "bytes": (write("run.json", b"\xff\xfe"), "run.json: is no JSON"),
+    "a list": (write("run.json", b"[1]"), "run.json: is no JSON object"),
+    "nested": (write("run.json", b"[" * 100_000), "run.json: is no JSON"),
+    "large": (write("run.json", b" " * (1 << 20) + b"{}"), "run.json: larger than"),
+    "no config": (lambda f: edit_record(f, lambda r: r.pop("config")), "run.json"),
+    "config a list": (lambda f: edit_record(f, lambda r: r.update(config=[1])), "run.json: config: "),
+    "config null": (lambda f: edit_record(f, lambda r: r.update(config=None)), "run.json: config: "),
+    "scenario a list": (lambda f: edit_record(f, lambda r: r["config"].update(scenario=[1])), "run.json: config: "),
+    "unknown key": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(x=1)), "reward.x: unknown key"),
+    "nan": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=math.nan)), "reward.scale: "),
+    "huge": (lambda f: edit_record(f, lambda r: r["config"]["algorithm"].update(net_arch=[4096] * 8)), "net_arch: the"),
+    "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json"),
+    "hashes a list": (lambda f: edit_record(f, lambda r: r.update(sha256=[])), "run.json"),
+    "hash a number": (
+        lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": 3})), "run.json"),
+    "another hash": (
+        lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": "0" * 64})),
+        "policy.safetensors: changed since it was written"),
+    "no policy": (lambda f: (f / "policy.safetensors").unlink(), "policy.safetensors: the file is missing"),
+    "other bytes": (write("policy.safetensors", b"x"), "policy.safetensors: changed since it was written"),
+    "pickle": (lambda f: (write("policy.safetensors", b"\x80\x04N.")(f), edit_record(
+        f, lambda r: r["sha256"].update({"policy.safetensors": files.sha256_bytes(b"\x80\x04N.")}))),
+        "policy.safetensors: does not hold this policy's weights"),
+    "not finite": (lambda f: rewrite_policy(f, lambda t: next(iter(t.values())).fill_(math.nan)), "not finite"),
+    "a name": (lambda f: rewrite_policy(f, lambda t: t.update(other=t.pop(next(iter(t))))), "does not hold"),
+    "one more": (lambda f: rewrite_policy(f, lambda t: t.update(other=th.ones(1))), "does not hold"),
+    "a shape": (lambda f: rewrite_policy(f, lambda t: t.update({k: v[..., :1].clone() for k, v in t.items()})),
+        "does not hold"),
+    "a type": (lambda f: rewrite_policy(f, lambda t: t.update({k: v.to(th.float64) for k, v in t.items()})),
+        "policy.safetensors"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_run_is_refused_by_file_and_reason(tmp_path: Path, damage: str) -> None:
+    folder = copy_of_finished(tmp_path)
+    change, reason = DAMAGE[damage]
+    change(folder)
+    with pytest.raises(files.DamagedFileError) as caught:
+        load_run(folder)
+    assert reason in str(caught.value)
+    assert str(folder) in str(caught.value)
+    assert len(str(caught.value)) < 700

@@ -1,0 +1,145 @@
+"""A grid file becomes runs: every one once, each checked before the first is started."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from marl_encircle import cli
+from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.grid import Grid, Job, arguments, load_grid
+from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.tables import paper_results
+from marl_encircle.experiments.yaml_files import ConfigError
+
+ONE = Setting(1.1, 3, 1)
+
+
+def grid_of(folder: Path, text: str) -> Grid:
+    (folder / "grid.yaml").write_text(text)
+    return load_grid(str(folder / "grid.yaml"))
+
+
+def test_the_smoke_grid_is_two_tiny_cells() -> None:
+    assert load_grid("smoke") == Grid((Job("ours", ONE, 900, "smoke"), Job("ma2019", ONE, 900, "smoke")), {})
+
+
+def test_the_committed_grid_has_its_cells_and_tuning_seeds() -> None:
+    grid = load_grid("committed")
+    for obstacles in (0, 1):
+        for method in ("ours", "model_b", "model_a", "ma2019"):
+            seeds = [job.seed for job in grid.jobs if (job.reward, job.setting) == (method, Setting(1.1, 3, obstacles))]
+            assert seeds == ([] if (method, obstacles) == ("model_a", 0) else [900, 901, 902])
+    assert {job.profile for job in grid.jobs} == {"full"}
+
+
+def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
+    grid = load_grid("all")
+    cells = {job.config.cell for job in grid.jobs} | grid.aliases.keys()
+    asked = {cell for table in paper_results().values() for cell in table}
+    assert len({cell.setting for cell in asked}) == 10
+    assert asked <= cells
+    assert len(set(grid.jobs)) == len(grid.jobs)
+    assert {job.seed for job in grid.jobs}.isdisjoint({900, 901, 902})
+
+
+def test_without_obstacles_model_a_has_the_runs_of_ours() -> None:
+    setting = Setting(1.1, 3, 0)
+    for name in ("committed", "all"):
+        grid = load_grid(name)
+        assert grid.aliases[Cell("model_a", setting)] == Cell("ours", setting)
+        assert Cell("model_a", setting) not in {job.config.cell for job in grid.jobs}
+
+
+GRID = """profile: smoke
+groups:
+  - methods: [ours, {method}]
+    settings: [{{speed_ratio: 1.1, pursuers: 3, obstacles: 1}}]
+    seeds: [2, 3, 2]
+shared: []
+"""
+
+
+def test_a_run_that_is_asked_for_twice_is_one_run(tmp_path: Path) -> None:
+    grid = grid_of(tmp_path, GRID.format(method="ours"))
+    assert [(job.reward, job.seed) for job in grid.jobs] == [("ours", 2), ("ours", 3)]
+
+
+def test_a_users_method_is_given_by_path_from_the_grids_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "idea.yaml").write_text("base: ours\nscale: 0.1\n")
+    for path in ("mine/idea.yaml", str(tmp_path / "mine" / "idea.yaml")):
+        monkeypatch.chdir("/")
+        grid = grid_of(tmp_path, GRID.format(method=path))
+        assert grid.jobs[2].config.reward.scale == 0.1
+        assert grid.jobs[2].config.cell == Cell("idea", ONE)
+
+
+def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
+    for scale in (0.1, 0.2):
+        (tmp_path / "idea.yaml").write_text(f"base: ours\nscale: {scale}\n")
+        assert grid_of(tmp_path, GRID.format(method="idea.yaml")).jobs[2].config.reward.scale == scale
+
+
+def test_two_methods_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "ours.yaml").write_text("base: ours\nscale: 0.1\n")
+    with pytest.raises(ConfigError, match=r"the methods ours and .*ours\.yaml have one name, ours"):
+        grid_of(tmp_path, GRID.format(method="ours.yaml"))
+
+
+SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("profile: smoke\n", "", "profile: missing"),
+        ("profile: smoke", "profile: quick", "profile: input should be 'full' or 'smoke'; got 'quick'"),
+        ("shared: []", "shares: []", "shares: unknown key; did you mean shared?"),
+        ("methods:", "method:", "groups.0.method: unknown key; did you mean methods?"),
+        ("pursuers:", "pursuer:", "groups.0.settings.0.pursuer: unknown key; did you mean pursuers?"),
+        ("pursuers: 3", "pursuers: true", "groups.0.settings.0.pursuers: input should be a valid integer; got True"),
+        ("pursuers: 3", "pursuers: 0", "scenario.pursuers must be between 1 and 64; got 0"),
+        ("obstacles: 1", "obstacles: 30", "too many bodies to place"),
+        ("speed_ratio: 1.1", "speed_ratio: 0.5", "scenario.speed_ratio must be between"),
+        ("obstacles: 1", "obstacles: 1, scene: tunel", "scenario.scene must be one of"),
+        ("[2, 3, 2]", "[-1]", "groups.0.seeds.0: input should be greater than or equal to 0; got -1"),
+        ("[2, 3, 2]", "[4294967296]", "groups.0.seeds.0: input should be less than 4294967296"),
+        ("[2, 3, 2]", "[true]", "groups.0.seeds.0: input should be a valid integer; got True"),
+        ("[2, 3, 2]", "3", "groups.0.seeds: input should be a valid list; got 3"),
+        ("[ours, ours]", "[ours, our]", "reward 'our': no such name, and no path of a .yaml file; did you mean ours?"),
+        ("shared: []", "shared: [{method: a, run_of: ours, obstacles: 0}]", "unknown key; did you mean runs_of?"),
+        ("shared: []", "shared: [{method: ours, runs_of: model_a, obstacles: 1}]", "which the grid lacks"),
+    ],
+)  # fmt: skip
+def test_a_bad_grid_is_refused_by_key_and_reason(tmp_path: Path, old: str, new: str, reason: str) -> None:
+    text = GRID.format(method="ours")
+    assert old in text
+    with pytest.raises(ConfigError) as caught:
+        grid_of(tmp_path, text.replace(old, new, 1))
+    assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "reason"), [("al", "did you mean all?"), ("absent.yaml", "No such file")])
+def test_a_grid_that_is_not_there_is_refused(name: str, reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_grid(name)
+    assert reason in str(caught.value)
+
+
+def test_a_job_on_the_command_line_is_the_same_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    trained: list[Any] = []
+
+    def note(config: Any, seed: int, *_: Any, **__: Any) -> Any:
+        trained.append((config, seed))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "train", note)
+    job = Job("model_c", Setting(1.25, 4, 2, "concave"), 17, "smoke")
+    CliRunner().invoke(cli.app, ["train", *arguments(job), "--out", str(tmp_path)])
+    assert trained == [(job.config, 17)]
+    expected = load_config(
+        "model_c", profile="smoke", scenario={"speed_ratio": 1.25, "pursuers": 4, "obstacles": 2, "scene": "concave"}
+    )
+    assert job.config == expected

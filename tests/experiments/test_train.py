@@ -1,0 +1,448 @@
+"""A run is the same however often it is stopped, whatever is logged, on either engine; and says so in its folder."""
+
+import itertools
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch as th
+from tiny_runs import (
+    FILES,
+    TINY,
+    contents,
+    copy_of_finished,
+    everything_in,
+    finished,
+    tiny,
+    tiny_arguments,
+    train_slowly,
+)
+from torch.nn import functional
+
+from marl_encircle import files
+from marl_encircle.core.simulator import PlacementError
+from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments import checkpoint, train
+from marl_encircle.experiments.build import Engine, read_record
+from marl_encircle.experiments.callbacks import Stopped
+from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.records import episodes_from_csv, read_runs
+from marl_encircle.maddpg import MADDPG, maddpg
+
+ENGINES = get_args(Engine)
+KEYS = [
+    "schema", "status", "method", "config", "config_hash", "source_hash", "seed", "engine", "git_commit", "versions",
+    "cpu", "wall_seconds", "cpu_seconds", "world_steps", "updates", "sha256",
+]  # fmt: skip
+
+
+# what is left behind
+
+
+def test_a_finished_folder_holds_the_record_and_what_it_vouches_for() -> None:
+    folder = finished()
+    assert everything_in(folder) == ["episodes.csv", "policy.safetensors", "progress.csv", "run.json"]
+    assert folder.parts[-3:] == ("ours", "ratio1.1_n3_m1_random", "seed0")
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    assert list(record) == KEYS
+    assert record["schema"] == 1
+    assert (record["status"], record["method"], record["seed"], record["engine"]) == ("finished", "ours", 0, "native")
+    assert Config.from_dict(record["config"]) == tiny()
+    assert record["config_hash"] == tiny().hash
+    assert record["world_steps"] == 400
+    assert record["updates"] == 85  # 100 steps of 4 worlds, but for the 15 with random actions
+    assert record["cpu_seconds"] > 0
+    assert record["wall_seconds"] > 0
+    assert record["sha256"] == {name: files.sha256_file(folder / name) for name in sorted(FILES)}
+    assert {"python", "numpy", "torch", "stable-baselines3"} <= record["versions"].keys()
+    assert len(record["source_hash"]) == 64
+
+
+def test_the_learning_curve_has_its_points_and_no_clock() -> None:
+    lines = (finished() / "progress.csv").read_text().splitlines()
+    assert lines[0] == "world_steps,success,mean_episode_length,success_all,success_pursuers,sigma_c"
+    assert [int(line.split(",")[0]) for line in lines[1:]] == [120, 240, 360, 400]
+
+
+def test_the_rounds_are_those_of_the_evaluation_section() -> None:
+    rounds = episodes_from_csv((finished() / "episodes.csv").read_text())
+    assert [each.round for each in rounds] == list(range(8))
+    assert {each.step_all for each in rounds} != {None}, "with nothing but failures equal rounds would say little"
+
+
+def test_the_tables_read_what_the_training_wrote() -> None:
+    (run,) = read_runs(finished().parents[2])
+    assert (run.cell, run.seed, run.status, run.closure) == (tiny().cell, 0, "finished", "all")
+
+
+def test_the_source_hash_covers_code_and_configs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    before = train.source_hash()
+    for name in ("a.py", "b/c.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("1\n")
+    monkeypatch.setattr(train, "PACKAGE", tmp_path)
+    here = train.source_hash()
+    assert here != before
+    for name in ("a.py", "b/c.yaml"):
+        (tmp_path / name).write_text("2\n")
+        assert train.source_hash() != here
+        (tmp_path / name).write_text("1\n")
+    assert train.source_hash() == here
+
+
+def test_an_installation_does_not_take_a_strangers_commit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    inside = tmp_path / "venv" / "site-packages" / "marl_encircle"
+    inside.mkdir(parents=True)
+    monkeypatch.setattr(train, "PACKAGE", inside)
+    assert train.git_commit() is None
+
+
+# again, and another one
+
+
+def test_a_finished_run_is_not_trained_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = copy_of_finished(tmp_path)
+    monkeypatch.setattr(train, "_Run", lambda *_: pytest.fail("it was trained again"))
+    assert train.train(tiny(), 0, "native", tmp_path) == (folder, False)
+
+
+@pytest.mark.parametrize(
+    ("config", "engine", "line"),
+    [
+        (["reward.scale=0.1"], "native", "config.reward.scale: 0.1 here, 0.05 there"),
+        (["reward.terms.time=null"], "native", "config.reward.terms.time: None here, 8.0 there"),
+        ([], "supersuit", "engine: supersuit here, native there"),
+    ],
+)
+def test_a_folder_with_another_run_is_left_alone(tmp_path: Path, config: list[str], engine: Any, line: str) -> None:
+    folder = copy_of_finished(tmp_path)
+    before = contents(folder), (folder / "run.json").read_bytes()
+    with pytest.raises(train.OtherRunError) as caught:
+        train.train(tiny(overrides=config), 0, engine, tmp_path)
+    message = str(caught.value)
+    assert str(folder) in message
+    assert [text.strip() for text in message.splitlines()[1:]] == [line]
+    assert (contents(folder), (folder / "run.json").read_bytes()) == before
+
+
+def test_an_unfinished_run_of_another_configuration_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop_at(monkeypatch, 20)
+    with pytest.raises(Stopped):
+        train.train(tiny(), 0, "native", tmp_path)
+    monkeypatch.undo()
+    with pytest.raises(train.OtherRunError, match=r"reward\.scale: 0\.1 here, 0\.05 there"):
+        train.train(tiny(overrides=["reward.scale=0.1"]), 0, "native", tmp_path)
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
+    with files.folder_lock(train.run_folder(tiny(), 0, tmp_path)), pytest.raises(files.FolderLockedError):
+        train.train(tiny(), 0, "native", tmp_path)
+
+
+@pytest.mark.parametrize(("first", "final"), [(0.3, 0.3), (0.3, 0.05), (0.05, 0.3)])
+def test_bodies_that_cannot_be_placed_are_told_before_anything_is_written(
+    tmp_path: Path, first: float, final: float
+) -> None:
+    # two discs whose centres lie in a square of side 0.2
+    crowded = ["scenario.obstacle_limit=0.1", f"scenario.obstacle_radius={final}"]
+    ramp = f"training.curriculum.obstacle_radius={{start: {first}, world_steps: 300}}"
+    config = tiny(obstacles=2, overrides=[*crowded, ramp])
+    with pytest.raises(PlacementError):
+        train.train(config, 0, "native", tmp_path)
+    assert everything_in(tmp_path) == []
+
+
+# the same bits
+
+
+@pytest.mark.parametrize("overrides", [[], ["algorithm.name=matd3", "algorithm.critic=per_agent"]])
+def test_both_engines_train_the_same_policy(tmp_path: Path, overrides: list[str]) -> None:
+    if overrides:
+        config = tiny(overrides=overrides)
+        native, supersuit = (train.train(config, 1, engine, tmp_path / engine)[0] for engine in ENGINES)
+    else:
+        native, supersuit = map(finished, ENGINES)
+    assert contents(native) == contents(supersuit)
+
+
+def test_without_obstacles_model_a_and_ours_are_one(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        ours, model_a = (
+            train.train(tiny(name, obstacles=0), seed, "native", tmp_path)[0] for name in ("ours", "model_a")
+        )
+        for name in ("policy.safetensors", "episodes.csv", "progress.csv"):
+            assert (ours / name).read_bytes() == (model_a / name).read_bytes(), name
+
+
+def test_with_obstacles_model_a_and_ours_are_not(tmp_path: Path) -> None:
+    model_a = train.train(tiny("model_a"), 0, "native", tmp_path)[0]
+    assert contents(model_a)["policy.safetensors"] != contents(finished())["policy.safetensors"]
+
+
+def test_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
+    arguments = ["train", *tiny_arguments("--out", str(tmp_path), "--quiet", "--no-tensorboard")]
+    done = subprocess.run(
+        [sys.executable, "-m", "marl_encircle.cli", *arguments],
+        env={**os.environ, "PYTHONHASHSEED": "7"}, cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert contents(Path(done.stdout.splitlines()[-1])) == contents(finished())
+
+
+def test_another_seed_writes_other_bytes(tmp_path: Path) -> None:
+    other = contents(train.train(tiny(), 1, "native", tmp_path)[0])
+    assert all(other[name] != contents(finished())[name] for name in FILES)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "how"),
+    [
+        (["training.curve_every=400"], {}),
+        (["training.curve_every=20"], {}),
+        (["evaluation.curve_episodes=50", "evaluation.curve_seed=3"], {}),
+        ([], {"checkpoint_every": 0.0}),
+        ([], {"tensorboard": True, "progress_bar": True}),
+    ],
+)
+def test_watching_a_training_does_not_change_it(tmp_path: Path, overrides: list[str], how: dict[str, Any]) -> None:
+    folder, _ = train.train(tiny(overrides=overrides), 0, "native", tmp_path, **how)
+    for name in ("policy.safetensors", "episodes.csv"):
+        assert contents(folder)[name] == contents(finished())[name]
+
+
+# stopped, and gone on
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, vec_step: int, number: int = signal.SIGTERM) -> None:
+    """Have a signal come in that step of the worlds, counted from the start of the training."""
+    step_wait = CurriculumVecEnv.step_wait
+
+    def stopping(self: CurriculumVecEnv) -> Any:
+        if self.world_steps == vec_step * 4:
+            os.kill(os.getpid(), number)
+        return step_wait(self)
+
+    monkeypatch.setattr(CurriculumVecEnv, "step_wait", stopping)
+
+
+def keep_the_end(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Keep everything that a further training would depend on, at the end of each training."""
+    ends: list[dict[str, Any]] = []
+    record = train._Run.record
+
+    def keeping(self: Any, status: str) -> None:
+        ends.append(checkpoint.capture(self.model, self.curriculum))
+        record(self, status)
+
+    monkeypatch.setattr(train._Run, "record", keeping)
+    return ends
+
+
+def differences(one: Any, other: Any, path: str = "") -> list[str]:
+    """Where two trees differ in any bit."""
+    if isinstance(one, th.Tensor):
+        one, other = one.numpy(), other.numpy()
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        return [found for key in one for found in differences(one[key], other[key], f"{path}/{key}")]
+    if isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        return [found for i in range(len(one)) for found in differences(one[i], other[i], f"{path}/{i}")]
+    if isinstance(one, np.ndarray):
+        return [] if one.tobytes() == other.tobytes() else [path]
+    return [] if one == other else [path]
+
+
+@pytest.mark.parametrize(
+    ("engine", "algorithm", "vec_step"),
+    # before the first step; among random actions; before and after the buffer is full; in the midst of rounds
+    [*(("native", "maddpg", step) for step in (0, 7, 33, 71)), ("native", "matd3", 50), ("supersuit", "maddpg", 50)],
+)
+def test_a_stopped_training_goes_on_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine, algorithm: str, vec_step: int
+) -> None:
+    config = tiny(overrides=[f"algorithm.name={algorithm}"])
+    ends = keep_the_end(monkeypatch)
+    whole, _ = train.train(config, 0, engine, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_at(patch, vec_step)
+        with pytest.raises(Stopped, match="stopped by SIGTERM; the same command goes on from here"):
+            train.train(config, 0, engine, tmp_path / "parts")
+    folder = train.run_folder(config, 0, tmp_path / "parts")
+    assert (folder / checkpoint.NAME).exists()
+    assert not (folder / "run.json").exists()
+    assert train.train(config, 0, engine, tmp_path / "parts") == (folder, True)
+    assert differences(*ends) == []
+    assert contents(folder) == contents(whole)
+    assert everything_in(folder) == everything_in(whole)
+    one, other = read_record(folder), read_record(whole)
+    assert {key for key in one if one[key] != other[key]} <= {"wall_seconds", "cpu_seconds", "git_commit"}
+
+
+def test_a_training_may_be_stopped_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tiny(overrides=["training.world_steps=40", "algorithm.random_world_steps=8", "training.curve_every=20"])
+    whole, _ = train.train(config, 0, "native", tmp_path / "whole")
+    for step in range(9):
+        with monkeypatch.context() as patch:
+            stop_at(patch, step, (signal.SIGINT, signal.SIGTERM)[step % 2])
+            with pytest.raises(Stopped):
+                train.train(config, 0, "native", tmp_path / "parts")
+    folder, _ = train.train(config, 0, "native", tmp_path / "parts")
+    assert contents(folder) == contents(whole)
+
+
+FORGETFUL: dict[str, Callable[[dict[str, Any]], object]] = {
+    "exploration": lambda saved: saved["random"]["exploration"]["state"].update(state=1),
+    "replay sampling": lambda saved: saved["random"]["numpy"].__setitem__(2, 3),
+    "worlds": lambda saved: saved["worlds"][0]["simulator"]["streams"][0]["state"].update(state=1),
+    "curriculum": lambda saved: saved.update(world_steps=saved["world_steps"] - 4),
+    "targets": lambda saved: saved["parameters"]["policy"].update(
+        {key: value * 0 for key, value in saved["parameters"]["policy"].items() if "actor_target" in key}
+    ),
+    "optimiser": lambda saved: [state.update(exp_avg=state["exp_avg"] * 0)
+                                for state in saved["parameters"]["actor.optimizer"]["state"].values()],
+    "buffer": lambda saved: saved["replay"]["rewards"].fill(0),
+    "updates": lambda saved: saved["counters"].update(_n_updates=saved["counters"]["_n_updates"] + 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("forgotten", FORGETFUL)
+def test_what_a_resume_leaves_out_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forgotten: str) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 50)
+        with pytest.raises(Stopped):
+            train.train(tiny(), 0, "native", tmp_path)
+    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    saved = checkpoint.load_tree(path)
+    FORGETFUL[forgotten](saved["training"])
+    checkpoint.save_tree(path, saved)
+    folder, _ = train.train(tiny(), 0, "native", tmp_path)
+    assert contents(folder)["policy.safetensors"] != contents(finished())["policy.safetensors"]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_process_stopped_by_a_signal_leaves_what_the_next_goes_on_from(
+    tmp_path: Path, engine: Engine, number: int
+) -> None:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["marl_encircle.cli"])
+    checkpoint_every = 0.05 if number == signal.SIGKILL else 120.0
+    process = context.Process(target=train_slowly, args=(tmp_path, engine, checkpoint_every))
+    process.start()
+    folder = train.run_folder(tiny(), 0, tmp_path)
+    wanted = folder / ("progress.csv" if number != signal.SIGKILL else checkpoint.NAME)
+    deadline = time.monotonic() + 60
+    while not wanted.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(process.pid or 0, number)
+    process.join(10)
+    assert process.exitcode == (-number if number == signal.SIGKILL else 1), "an uncaught Stopped ends a process with 1"
+    assert not (folder / "run.json").exists()
+    assert (folder / checkpoint.NAME).exists()
+    saved = checkpoint.load_tree(folder / checkpoint.NAME)
+    assert 0 < saved["training"]["world_steps"] < 400
+    train.train(tiny(), 0, engine, tmp_path)
+    assert contents(folder) == contents(finished())
+    assert everything_in(folder) == everything_in(finished())
+
+
+@pytest.mark.parametrize("change", ["cut", "flip", "other"])
+def test_a_damaged_checkpoint_is_named_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 20)
+        with pytest.raises(Stopped):
+            train.train(tiny(), 0, "native", tmp_path)
+    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    data = bytearray(path.read_bytes())
+    if change == "cut":
+        path.write_bytes(data[:-1])
+    elif change == "flip":
+        data[-5] ^= 1
+        path.write_bytes(data)
+    else:
+        saved = checkpoint.load_tree(path)
+        saved["training"]["parameters"]["policy"].popitem()
+        checkpoint.save_tree(path, saved)
+    before = path.read_bytes()
+    with pytest.raises(files.DamagedFileError, match=r"checkpoint\.safetensors"):
+        train.train(tiny(), 0, "native", tmp_path)
+    assert path.read_bytes() == before
+
+
+# diverged
+
+
+@pytest.mark.parametrize("when", [40, 99])
+@pytest.mark.parametrize("what", ["loss", "weights"])
+def test_a_diverged_training_is_kept_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: int, what: str
+) -> None:
+    update = when + 1 - 15  # random actions come first
+    if what == "loss":
+        calls = itertools.count(1)
+        mse_loss = functional.mse_loss
+        late = SimpleNamespace(mse_loss=lambda *a, **k: mse_loss(*a, **k) * (1 if next(calls) < update else th.nan))
+        monkeypatch.setattr(maddpg, "functional", late)
+    else:
+        optimize = MADDPG._optimize
+
+        def diverging(self: MADDPG, network: Any, loss: th.Tensor) -> None:
+            optimize(self, network, loss)
+            if self._n_updates >= update:
+                with th.no_grad():
+                    next(self.actor.parameters()).fill_(th.inf)
+
+        monkeypatch.setattr(MADDPG, "_optimize", diverging)
+    folder, worked = train.train(tiny(), 0, "native", tmp_path)
+    assert worked
+    record = read_record(folder)
+    assert list(record) == KEYS
+    assert record["status"] == "diverged"
+    assert record["world_steps"] == 4 * (when + 1)
+    assert everything_in(folder) == ["policy.safetensors", "progress.csv", "run.json"]
+    assert record["sha256"] == {
+        name: files.sha256_file(folder / name) for name in ("policy.safetensors", "progress.csv")
+    }
+    (run,) = read_runs(tmp_path)
+    assert run.status == "diverged"
+    assert train.train(tiny(), 0, "native", tmp_path) == (folder, False)
+
+
+def test_a_real_learning_rate_that_is_too_large_diverges_or_ends(tmp_path: Path) -> None:
+    overrides = ["algorithm.learning_rate=1.0", "algorithm.gamma=1.0", "algorithm.tau=1.0", "reward.scale=1e30"]
+    folder, _ = train.train(tiny(overrides=overrides), 0, "native", tmp_path)
+    assert read_record(folder)["status"] == "diverged"
+
+
+def test_many_runs_leave_no_open_files(tmp_path: Path) -> None:
+    config = tiny(overrides=["training.world_steps=16"])
+
+    def count() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    train.train(config, 99, "native", tmp_path, tensorboard=True)
+    before = count()
+    for seed in range(3):
+        train.train(config, seed, "native", tmp_path, tensorboard=True)
+    assert count() == before
+
+
+def test_the_tiny_training_is_what_these_tests_take_it_for() -> None:
+    config = tiny()
+    assert len(TINY) > 5
+    assert config.training.curriculum["safety_distance"] is not None
+    assert config.algorithm.buffer_world_steps < config.training.world_steps
