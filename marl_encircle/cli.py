@@ -222,6 +222,8 @@ def config_show(
         typer.echo(json.dumps(values, indent=2))
         return
     console = Console()
+    r = config.reward
+    console.print(f"{r.name}: closure {r.closure}, {'two stages' if r.two_stage else 'one stage'}, scale {r.scale:g}")
     console.print(_reward_table(config))
     for section in ("scenario", "algorithm", "training", "evaluation"):
         table = Table("key", "value", title=section)
@@ -261,10 +263,8 @@ def _config(
 
 
 def _reward_table(config: Config) -> Table:
-    r = config.reward
-    title = f"{r.name}: closure {r.closure}, {'two stages' if r.two_stage else 'one stage'}, scale {r.scale:g}"
-    table = Table("term", "weight", "parameters", title=title)
-    for name, (weight, parameters) in r.build().active.items():
+    table = Table("term", "weight", "parameters", title="reward")
+    for name, (weight, parameters) in config.reward.build().active.items():
         table.add_row(name, f"{weight:g}", ", ".join(f"{key}={value:g}" for key, value in parameters.items()))
     return table
 

@@ -1,12 +1,14 @@
 """Trainings of a second or less, the command run in this process, and a training to be stopped from outside."""
 
 import atexit
+import multiprocessing
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,3 +104,12 @@ def train_slowly(out: Path, engine: Engine, checkpoint_every: float) -> None:
 
     CurriculumVecEnv.step_wait = slow  # type: ignore[method-assign]
     train(tiny(), 0, engine, out, checkpoint_every=checkpoint_every)
+
+
+def in_another_process(function: Callable[..., None], *arguments: object) -> BaseProcess:
+    """Start a function in a process that has imported the package and done nothing else."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["marl_encircle.cli"])
+    process = context.Process(target=function, args=arguments)
+    process.start()
+    return process

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -23,6 +22,7 @@ from tiny_runs import (
     copy_of_finished,
     everything_in,
     finished,
+    in_another_process,
     tiny,
     tiny_arguments,
     train_slowly,
@@ -337,11 +337,8 @@ def test_what_a_resume_leaves_out_is_noticed(tmp_path: Path, monkeypatch: pytest
 def test_a_process_stopped_by_a_signal_leaves_what_the_next_goes_on_from(
     tmp_path: Path, engine: Engine, number: int
 ) -> None:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["marl_encircle.cli"])
     checkpoint_every = 0.05 if number == signal.SIGKILL else 120.0
-    process = context.Process(target=train_slowly, args=(tmp_path, engine, checkpoint_every))
-    process.start()
+    process = in_another_process(train_slowly, tmp_path, engine, checkpoint_every)
     folder = train.run_folder(tiny(), 0, tmp_path)
     wanted = folder / ("progress.csv" if number != signal.SIGKILL else checkpoint.NAME)
     deadline = time.monotonic() + 60

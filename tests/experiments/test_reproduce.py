@@ -1,0 +1,164 @@
+"""The whole road for a grid: what is missing is trained and evaluated, once, and the tables follow."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import TINY
+
+from marl_encircle import files
+from marl_encircle.experiments import grid as grids
+from marl_encircle.experiments import reproduce as reproduction
+from marl_encircle.experiments import sweep as sweeps
+from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.grid import Job, load_grid
+from marl_encircle.experiments.reproduce import TABLE1_METHODS, Reproduction, options_of, reproduce, write_tables
+from marl_encircle.experiments.tables import MethodOptions, render_table1
+from marl_encircle.experiments.train import run_folder, train
+
+TABLES = [
+    f"{name}.{kind}"
+    for name in ("table2", "table3", "table4", "table_common_rule", "table_differences")
+    for kind in ("csv", "md")
+]
+
+
+class Trained:
+    """A worker that trains in this process as soon as it is started."""
+
+    def __init__(self, job: Job, out: Path) -> None:
+        train(job.config, job.seed, "native", out)
+
+    def poll(self) -> int:
+        return 0
+
+    def send_signal(self, number: int) -> None:
+        pass
+
+    def wait(self, timeout: float | None = None) -> int:
+        return 0
+
+    kill = wait
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make every run of a grid tiny, and train it in this process."""
+
+    def tiny(*arguments: Any, **named: Any) -> Config:
+        return load_config(*arguments, **{**named, "overrides": TINY})
+
+    monkeypatch.setattr(grids, "load_config", tiny)
+    monkeypatch.setattr(sweeps, "_start", Trained)
+    monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
+
+
+def counts(result: Reproduction) -> tuple[int, int, int]:
+    return result.trained, result.evaluated, result.reused
+
+
+def tables(results: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((results / "tables").iterdir())}
+
+
+def folders(results: Path) -> list[Path]:
+    return [run_folder(job.config, job.seed, results / "runs") for job in load_grid("smoke").jobs]
+
+
+def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) -> None:
+    assert counts(reproduce("smoke", tmp_path, 2)) == (2, 0, 0)
+    before = tables(tmp_path)
+    assert sorted(before) == sorted(["table1.md", *TABLES])
+    assert counts(reproduce("smoke", tmp_path, 1)) == (0, 0, 2)
+    assert tables(tmp_path) == before
+
+    first, second = folders(tmp_path)
+    rounds = (first / "episodes.csv").read_bytes()
+    record = json.loads((first / "run.json").read_text())
+    (first / "episodes.csv").unlink()
+    del record["sha256"]["episodes.csv"]
+    files.write_json(first / "run.json", record)
+    (second / "episodes.csv").unlink()  # its hash stays
+    assert counts(reproduce("smoke", tmp_path, 1)) == (0, 2, 0)
+    assert (first / "episodes.csv").read_bytes() == rounds
+    assert tables(tmp_path) == before
+
+    (first / "run.json").unlink()  # the run is unfinished, and without a checkpoint starts anew
+    for path in (tmp_path / "tables").iterdir():
+        path.unlink()
+    assert counts(reproduce("smoke", tmp_path, 1)) == (1, 0, 1)
+    assert (first / "episodes.csv").read_bytes() == rounds
+    assert tables(tmp_path) == before
+
+
+def test_an_edited_row_is_found(tmp_path: Path) -> None:
+    reproduce("smoke", tmp_path, 1)
+    path = folders(tmp_path)[0] / "episodes.csv"
+    path.write_text(path.read_text().replace(",20,", ",19,", 1))
+    with pytest.raises(files.DamagedFileError, match=r"episodes\.csv: changed since it was written"):
+        reproduce("smoke", tmp_path, 1)
+
+
+def test_an_edited_policy_is_not_evaluated(tmp_path: Path) -> None:
+    reproduce("smoke", tmp_path, 1)
+    folder = folders(tmp_path)[0]
+    (folder / "episodes.csv").unlink()
+    (folder / "policy.safetensors").write_bytes(b"other")
+    with pytest.raises(files.DamagedFileError, match=r"policy\.safetensors: changed"):
+        reproduce("smoke", tmp_path, 1)
+
+
+def test_a_users_method_by_path_has_its_row(tmp_path: Path) -> None:
+    (tmp_path / "idea.yaml").write_text("base: ours\nscale: 0.1\n")
+    (tmp_path / "grid.yaml").write_text(
+        "profile: smoke\ngroups:\n  - methods: [idea.yaml]\n"
+        "    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]\n    seeds: [1]\nshared: []\n"
+    )
+    results = tmp_path / "results"
+    assert counts(reproduce(str(tmp_path / "grid.yaml"), results, 1)) == (1, 0, 0)
+    row = next(line for line in (results / "tables" / "table4.csv").read_text().splitlines() if "idea" in line)
+    assert "finished" in row or ",8," in row or "1" in row
+    assert "idea" in (results / "tables" / "table4.md").read_text()
+
+
+def test_runs_that_the_grid_does_not_ask_for_are_not_in_its_tables(tmp_path: Path) -> None:
+    reproduce("smoke", tmp_path, 1)
+    before = tables(tmp_path)
+    train(load_grid("smoke").jobs[0].config, 5, "native", tmp_path / "runs")
+    write_tables(load_grid("smoke"), tmp_path)
+    assert tables(tmp_path) == before
+
+
+def test_a_diverged_run_is_shown_and_not_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reproduce("smoke", tmp_path, 1)
+    path = folders(tmp_path)[0] / "run.json"
+    record = json.loads(path.read_text())
+    del record["sha256"]["episodes.csv"]
+    files.write_json(path, {**record, "status": "diverged"})
+    (path.parent / "episodes.csv").unlink()
+    monkeypatch.setattr(reproduction, "play_rounds", lambda *_: pytest.fail("it was evaluated"))
+    result = reproduce("smoke", tmp_path, 1)
+    assert counts(result) == (0, 0, 2)
+    assert result.sweep.diverged == 1
+    assert "diverged" in (tmp_path / "tables" / "table4.md").read_text()
+
+
+def test_table_1_is_the_papers() -> None:
+    # Zheng et al. (2023), Table 1
+    yes, no = True, False
+    assert {method: options_of(method) for method in TABLE1_METHODS} == {
+        "model_a": MethodOptions(two_stage=yes, obstacle_assisted=no, individual_contributing_angle=yes),
+        "model_b": MethodOptions(two_stage=no, obstacle_assisted=yes, individual_contributing_angle=yes),
+        "model_c": MethodOptions(two_stage=yes, obstacle_assisted=yes, individual_contributing_angle=no),
+        "ours": MethodOptions(two_stage=yes, obstacle_assisted=yes, individual_contributing_angle=yes),
+    }
+    text = render_table1({method: options_of(method) for method in TABLE1_METHODS})["table1.md"]
+    ticks = [line.count("✓") for line in text.splitlines() if line.startswith("|")][2:]
+    assert ticks == [2, 2, 2, 3]
+
+
+def test_an_unknown_grid_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="did you mean smoke"):
+        reproduce("smok", tmp_path / "results", 1)
+    assert not (tmp_path / "results").exists()

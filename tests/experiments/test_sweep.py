@@ -1,0 +1,181 @@
+"""A sweep trains what is missing, once, whatever happens to it or to its workers."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import TINY, in_another_process
+
+from marl_encircle import files
+from marl_encircle.experiments import sweep as sweeps
+from marl_encircle.experiments.grid import Job
+from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.sweep import Progress, name_of, sweep
+from marl_encircle.experiments.train import OtherRunError, run_folder
+
+POPEN = subprocess.Popen
+
+SETTING = Setting(1.1, 3, 1)
+JOBS = [Job("ours", SETTING, seed, "smoke") for seed in (0, 1, 2)]
+
+
+def made_up_worker(monkeypatch: pytest.MonkeyPatch, behave: str) -> None:
+    """Start small scripts instead of trainings; ``folder`` is the run's, ``seed`` its seed."""
+
+    def start(command: list[str], **options: Any) -> Any:
+        out, seed = command[command.index("--out") + 1], command[command.index("--seed") + 1]
+        folder = Path(out) / "ours" / "ratio1.1_n3_m1_random" / f"seed{seed}"
+        script = f"import json, os, pathlib, signal, sys, time; seed = {seed}; folder = pathlib.Path({str(folder)!r})\n"
+        return POPEN([sys.executable, "-I", "-S", "-c", script + behave], **options)
+
+    monkeypatch.setattr(sweeps.subprocess, "Popen", start)
+
+
+def record_text(status: str = "finished") -> str:
+    """A record that is right for every job of ``JOBS``, but for its seed."""
+    return json.dumps({"status": status, "config": JOBS[0].config.to_dict(), "engine": "native"})
+
+
+def finish(status: str = "finished") -> str:
+    return (
+        "folder.mkdir(parents=True)\n"
+        f"record = {{**json.loads({record_text(status)!r}), 'seed': seed}}\n"
+        "(folder / 'run.json').write_text(json.dumps(record))\n"
+    )
+
+
+def counts(progress: Progress) -> tuple[int, int, int, int, int, int]:
+    p = progress
+    return p.done, p.reused, p.diverged, len(p.failed), len(p.running), p.left
+
+
+def test_runs_are_trained_once_and_then_reused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_up_worker(monkeypatch, finish())
+    assert counts(sweep(JOBS[:2], tmp_path, 2)) == (2, 0, 0, 0, 0, 0)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("run.json")}
+    assert counts(sweep(JOBS, tmp_path, 1)) == (3, 2, 0, 0, 0, 0)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    made_up_worker(monkeypatch, "sys.exit('nothing is left to do')")
+    assert counts(sweep(JOBS, tmp_path, 1)) == (3, 3, 0, 0, 0, 0)
+
+
+def test_a_failed_run_is_counted_and_named_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made_up_worker(monkeypatch, "seed == 1 and os.kill(os.getpid(), signal.SIGKILL)\n" + finish())
+    progress = sweep(JOBS, tmp_path, 1)
+    assert counts(progress) == (2, 0, 0, 1, 0, 0)
+    assert progress.failed == [name_of(JOBS[1])] == ["ours ratio1.1_n3_m1_random seed1"]
+    made_up_worker(monkeypatch, finish())
+    assert counts(sweep(JOBS, tmp_path, 1)) == (3, 2, 0, 0, 0, 0)
+
+
+def test_a_diverged_run_is_counted_apart_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_up_worker(monkeypatch, finish("diverged") + "sys.exit(1)")
+    assert counts(sweep(JOBS[:2], tmp_path, 2)) == (0, 0, 2, 0, 0, 0)
+    made_up_worker(monkeypatch, "sys.exit('it was repeated')")
+    assert counts(sweep(JOBS[:2], tmp_path, 2)) == (0, 2, 2, 0, 0, 0)
+
+
+def test_as_many_run_as_there_are_workers_and_every_change_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made_up_worker(monkeypatch, "time.sleep(0.3)\n" + finish())
+    seen: list[tuple[int, int, int]] = []
+    sweep(JOBS, tmp_path, 2, lambda p: seen.append((p.done, len(p.running), p.left)))
+    assert max(running for _, running, _ in seen) == 2
+    assert seen[0] == (0, 2, 1)
+    assert seen[-1] == (3, 0, 0)
+    assert all(done + running + left == 3 for done, running, left in seen)
+
+
+def test_a_run_of_another_configuration_is_refused_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made_up_worker(monkeypatch, finish())
+    sweep(JOBS[:1], tmp_path, 1)
+    path = run_folder(JOBS[0].config, 0, tmp_path) / "run.json"
+    path.write_text(path.read_text().replace('"scale": 0.05', '"scale": 0.5'))
+    made_up_worker(monkeypatch, "sys.exit('it was started')")
+    with pytest.raises(OtherRunError, match=r"reward\.scale: 0\.05 here, 0\.5 there"):
+        sweep(JOBS, tmp_path, 1)
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_second_sweep_on_the_folder_is_refused_by_pid(tmp_path: Path) -> None:
+    with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError, match=f"process {os.getpid()} on host"):
+        sweep(JOBS, tmp_path, 1)
+
+
+SLEEPER = """
+import os, pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
+def stop(*_):
+    (folder / "stopped").touch()
+    sys.exit(143)
+signal.signal(signal.SIGTERM, stop)
+(folder / "pid.tmp").write_text(str(os.getpid()))
+(folder / "pid.tmp").rename(folder / "pid")
+time.sleep(60)
+"""
+
+
+def sweep_of_sleepers(folder: Path) -> None:
+    """A sweep whose workers do nothing until they are asked to stop."""
+
+    def start(command: list[str], **options: Any) -> Any:
+        return POPEN([sys.executable, "-I", "-S", "-c", SLEEPER, str(folder)], **options)
+
+    subprocess.Popen = start  # type: ignore[misc,assignment]
+    sweep(JOBS, folder, 1)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_sweep_that_ends_leaves_no_worker_behind(tmp_path: Path, number: int) -> None:
+    process = in_another_process(sweep_of_sleepers, tmp_path)
+    wait_for((tmp_path / "pid").exists)
+    worker = int((tmp_path / "pid").read_text())
+    assert alive(worker)
+    os.kill(process.pid or 0, number)
+    process.join(10)
+    wait_for(lambda: not alive(worker), 5)
+    if number == signal.SIGKILL:
+        assert process.exitcode == -number
+    else:
+        assert process.exitcode == 1, "an uncaught Stopped ends a process with 1"
+        assert (tmp_path / "stopped").exists(), "the worker was not asked, so it wrote no checkpoint"
+    with files.folder_lock(tmp_path):
+        pass
+
+
+def test_a_worker_trains_the_job_it_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(command: list[str], **options: Any) -> Any:
+        changes = [part for text in TINY for part in ("--set", text)]
+        return POPEN([*command, *changes], **options)
+
+    monkeypatch.setattr(sweeps.subprocess, "Popen", start)
+    # tiny as its worker makes it, it is not the job's run any more, and that is noticed too
+    with pytest.raises(OtherRunError, match=r"training\.n_worlds: 16 here, 4 there"):
+        sweep(JOBS[:1], tmp_path, 1)
+    assert (run_folder(JOBS[0].config, 0, tmp_path) / "episodes.csv").exists()

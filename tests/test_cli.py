@@ -1,0 +1,420 @@
+"""The command: what it prints, what it leaves, and with which code it ends."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import (
+    TINY,
+    Done,
+    command,
+    contents,
+    copy_of_finished,
+    everything_in,
+    finished,
+    in_another_process,
+    tiny_arguments,
+)
+
+from marl_encircle import cli, files
+from marl_encircle.experiments import grid as grids
+from marl_encircle.experiments import sweep as sweeps
+from marl_encircle.experiments import train
+from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.metrics import wilson_interval
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a command in this process, in an empty folder."""
+    (tmp_path / "cwd").mkdir()
+    monkeypatch.chdir(tmp_path / "cwd")
+    return lambda *arguments: command(capsys, monkeypatch, *arguments)
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    return tmp_path / "runs"
+
+
+# train
+
+
+def test_train_prints_its_folder_last_and_finishes_once(run: Run, runs: Path) -> None:
+    arguments = ["train", *tiny_arguments("--out", str(runs), "--quiet")]
+    first = run(*arguments)
+    assert first.code == 0, first.err
+    folder = Path(first.out.splitlines()[-1])
+    assert folder == runs / "ours" / "ratio1.1_n3_m1_random" / "seed0"
+    assert contents(folder) == contents(finished())
+    assert [path.name for path in folder.iterdir() if path.is_dir()] == ["tensorboard"]
+    again = run(*arguments)
+    assert (again.code, again.out, again.err) == (0, f"{folder}\n", "already finished\n")
+
+
+def test_train_refuses_a_folder_of_another_configuration_with_the_difference(run: Run, runs: Path) -> None:
+    folder = copy_of_finished(runs)
+    before = everything_in(runs)
+    done = run("train", *tiny_arguments("--out", str(runs), "--set", "algorithm.gamma=0.8"))
+    assert (done.code, done.out) == (2, "")
+    assert f"{folder} holds another run" in done.err
+    assert "config.algorithm.gamma: 0.8 here, 0.9 there" in done.err
+    assert everything_in(runs) == before
+
+
+def test_a_diverged_training_prints_its_folder_and_fails(run: Run, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train.DivergenceGuard, "check", lambda _: (_ for _ in ()).throw(train.Diverged("a loss")))
+    arguments = ["train", *tiny_arguments("--out", str(runs), "--quiet", "--no-tensorboard")]
+    for _ in range(2):
+        done = run(*arguments)
+        assert done.code == 1
+        folder = Path(done.out.splitlines()[-1])
+        assert json.loads((folder / "run.json").read_text())["status"] == "diverged"
+        assert "diverged" in done.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--reward", "our"],
+        ["--reward", "absent.yaml"],
+        ["--reward", "."],
+        ["--reward", "/"],
+        ["--reward", "bad.yaml"],
+        ["--set", "reward.terms.overal_angle=1"],
+        ["--set", "training.world_steps=true"],
+        ["--set", 'training.world_steps="3"'],
+        ["--set", "algorithm.learning_rate=.nan"],
+        ["--set", "reward.name=../../outside"],
+        ["--set", "reward.terms.time=" + "9" * 1000],
+        ["--set", "scenario.obstacle_radius=1e200"],
+        ["--set", "scenario.obstacle_limit=0.1", "--set", "scenario.obstacle_radius=0.3", "--obstacles", "2"],
+        ["--set", "algorithm.buffer_world_steps=9999999999", "--set", "training.world_steps=9999999999"],
+        ["--obstacles", "30"],
+        ["--pursuers", "0"],
+        ["--pursuers", "three"],
+        ["--pursuers", "3.5"],
+        ["--speed-ratio", "0.5"],
+        ["--speed-ratio", "nan"],
+        ["--scene", "tunel"],
+        ["--algorithm", "ppo"],
+        ["--seed", "-1"],
+        ["--seed", "4294967296"],
+        ["--engine", "fast"],
+        ["--profile", "quick"],
+        ["--checkpoint-every", "0"],
+        ["--no-such-option"],
+        ["surplus"],
+    ],
+    ids=" ".join,
+)
+def test_a_bad_configuration_ends_with_2_and_leaves_nothing(run: Run, tmp_path: Path, arguments: list[str]) -> None:
+    (tmp_path / "cwd" / "bad.yaml").write_text("base: ours\nname: !!python/name:os.system x\n")
+    before = everything_in(tmp_path)
+    done = run("train", *arguments)
+    assert done.code == 2
+    assert done.out == ""
+    assert done.err
+    assert "Traceback" not in done.err
+    assert len(done.err) < 2000
+    assert everything_in(tmp_path) == before
+
+
+def test_a_locked_folder_ends_with_2_naming_pid_and_host(run: Run, runs: Path) -> None:
+    with files.folder_lock(train.run_folder(load_config(profile="smoke"), 0, runs)):
+        done = run("train", "--profile", "smoke", "--out", runs)
+    assert done.code == 2
+    assert f"process {os.getpid()} on host {socket.gethostname()}" in done.err
+
+
+def test_a_folder_that_cannot_be_written_ends_with_1_by_name(run: Run, runs: Path) -> None:
+    runs.write_text("a file")
+    done = run("train", "--profile", "smoke", "--out", runs)
+    assert done.code == 1
+    assert str(runs) in done.err
+    assert "Traceback" not in done.err
+
+
+def test_a_damaged_checkpoint_ends_with_3(run: Run, runs: Path) -> None:
+    folder = train.run_folder(load_config(profile="smoke", overrides=TINY), 0, runs)
+    folder.mkdir(parents=True)
+    (folder / "checkpoint.safetensors").write_bytes(b"x")
+    done = run("train", *tiny_arguments("--out", str(runs)))
+    assert done.code == 3
+    assert "checkpoint.safetensors: is no checkpoint" in done.err
+
+
+def train_and_stop(out: Path, number: int) -> None:
+    """The command, which a signal meets in its midst."""
+    step_wait = train.CurriculumVecEnv.step_wait
+
+    def stopping(self: Any) -> Any:
+        if self.world_steps == 200:
+            os.kill(os.getpid(), number)
+        return step_wait(self)
+
+    train.CurriculumVecEnv.step_wait = stopping  # type: ignore[method-assign]
+    sys.argv = ["marl-encircle", "train", *tiny_arguments("--out", str(out), "--quiet", "--no-tensorboard")]
+    cli.main()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_training_ends_with_the_signals_code_and_goes_on(
+    run: Run, runs: Path, number: int, code: int
+) -> None:
+    process = in_another_process(train_and_stop, runs, number)
+    process.join(60)
+    assert process.exitcode == code
+    done = run("train", *tiny_arguments("--out", str(runs), "--quiet", "--no-tensorboard"))
+    assert done.code == 0
+    assert contents(Path(done.out.splitlines()[-1])) == contents(finished())
+
+
+def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARL_ENCIRCLE_DEBUG", "")
+    monkeypatch.setattr(sys, "argv", ["marl-encircle", "--debug", "train", "--reward", "our"])
+    with pytest.raises(ValueError, match="did you mean ours"):
+        cli.main()
+
+
+# evaluate
+
+KEYS = """method speed_ratio pursuers obstacles scene train_seed eval_seed episodes closure success success_low
+success_high mean_episode_length success_all success_pursuers sigma_c policy_sha256""".split()  # noqa: SIM905
+
+
+def test_evaluate_prints_one_object_and_reads_only(run: Run) -> None:
+    folder = finished()
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+    done = run("evaluate", folder, "--episodes", "30", "--seed", "77", "--json")
+    assert done.code == 0
+    result = json.loads(done.out)
+    assert list(result) == KEYS
+    assert [result[key] for key in KEYS[:9]] == ["ours", 1.1, 3, 1, "random", 0, 77, 30, "all"]
+    assert result["success"] == result["success_all"] >= result["success_pursuers"]
+    assert 0 < result["success"] < 1
+    low, high = wilson_interval(result["success"], 30)
+    assert (result["success_low"], result["success_high"]) == pytest.approx((low, high))
+    assert result["policy_sha256"] == files.sha256_file(folder / "policy.safetensors")
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
+    assert run("evaluate", folder, "--episodes", "30", "--seed", "77", "--json") == done
+    text = run("evaluate", folder, "--episodes", "30", "--seed", "77").out
+    assert [line.split()[0] for line in text.splitlines()] == KEYS
+
+
+def test_the_length_is_null_without_success(run: Run) -> None:
+    for seed in range(100):
+        result = json.loads(run("evaluate", finished(), "--episodes", "1", "--seed", seed, "--json").out)
+        assert (result["mean_episode_length"] is None) == (result["success"] == 0)
+        if result["success"] == 0:
+            return
+    pytest.fail("beginners cannot be that good")
+
+
+def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, runs: Path) -> None:
+    folder = copy_of_finished(runs)
+    before = (folder / "episodes.csv").read_bytes()
+    assert run("evaluate", folder, "--episodes", "8", "--write", "--json").code == 0
+    assert (folder / "episodes.csv").read_bytes() == before, "1000 is the configuration's seed too"
+    assert run("evaluate", folder, "--episodes", "9", "--seed", "4", "--write").code == 0
+    assert len((folder / "episodes.csv").read_text().splitlines()) == 10
+    record = json.loads((folder / "run.json").read_text())
+    assert record["sha256"]["episodes.csv"] == files.sha256_file(folder / "episodes.csv")
+    assert everything_in(folder) == everything_in(finished())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("policy.safetensors", b"x", "policy.safetensors: changed since it was written"),
+        ("policy.safetensors", None, "policy.safetensors: the file is missing"),
+        ("run.json", b"{", "run.json: is no JSON"),
+        ("run.json", b"{}", "run.json"),
+        ("run.json", None, "run.json: the file is missing"),
+    ],
+)
+def test_a_damaged_run_ends_with_3_and_its_reason(
+    run: Run, runs: Path, name: str, content: bytes | None, reason: str
+) -> None:
+    folder = copy_of_finished(runs)
+    (folder / name).unlink()
+    if content is not None:
+        (folder / name).write_bytes(content)
+    done = run("evaluate", folder, "--json")
+    assert (done.code, done.out) == (3, "")
+    assert reason in done.err
+    assert str(folder) in done.err
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--episodes", "10000001"], ["--seed", "-1"]])
+def test_a_bad_number_of_rounds_ends_with_2(run: Run, arguments: list[str]) -> None:
+    assert run("evaluate", finished(), *arguments).code == 2
+
+
+# sweep, tables, reproduce-tables
+
+
+class Made:
+    """A worker that trains in this process, unless its seed is 7."""
+
+    def __init__(self, job: grids.Job, out: Path) -> None:
+        if job.seed != 7:
+            train.train(job.config, job.seed, "native", out)
+
+    def poll(self) -> int:
+        return 0
+
+    def send_signal(self, number: int) -> None:
+        pass
+
+    def wait(self, timeout: float | None = None) -> int:
+        return 0
+
+    kill = wait
+
+
+@pytest.fixture
+def _tiny_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grids, "load_config", lambda *a, **k: load_config(*a, **{**k, "overrides": TINY}))
+    monkeypatch.setattr(sweeps, "_start", Made)
+    monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
+
+
+def grid(folder: Path, seeds: list[int]) -> Path:
+    path = folder / "grid.yaml"
+    path.write_text(
+        "profile: smoke\ngroups:\n  - methods: [ours]\n    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]\n"
+        f"    seeds: {seeds}\nshared: []\n"
+    )
+    return path
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_sweep_counts_and_names_what_failed(run: Run, runs: Path, tmp_path: Path) -> None:
+    done = run("sweep", grid(tmp_path, [0, 7]), "--out", runs, "--json")
+    assert done.code == 1
+    assert json.loads(done.out) == {"done": 1, "running": 0, "failed": 1, "diverged": 0, "left": 0}
+    assert "failed: ours ratio1.1_n3_m1_random seed7" in done.err
+    again = run("sweep", grid(tmp_path, [0]), "--out", runs, "--json")
+    assert again.code == 0
+    assert json.loads(again.out) == {"done": 1, "running": 0, "failed": 0, "diverged": 0, "left": 0}
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_a_second_sweep_ends_with_2_naming_pid_and_host(run: Run, runs: Path, tmp_path: Path) -> None:
+    with files.folder_lock(runs):
+        done = run("sweep", grid(tmp_path, [0]), "--out", runs)
+    assert done.code == 2
+    assert f"process {os.getpid()} on host {socket.gethostname()}" in done.err
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_reproduce_tables_ends_with_its_counts(run: Run, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    arguments = ("reproduce-tables", "--grid", "smoke", "--out", results)
+    first = run(*arguments)
+    assert first.code == 0, first.err
+    assert first.out.splitlines()[-1] == "trained=2 evaluated=0 reused=0"
+    tables = {path: path.read_bytes() for path in (results / "tables").iterdir()}
+    again = run(*arguments)
+    assert again.out.splitlines()[-1] == "trained=0 evaluated=0 reused=2"
+    assert again.out.splitlines()[:-1] == first.out.splitlines()[:-1]
+    folder = results / "runs" / "ma2019" / "ratio1.1_n3_m1_random" / "seed900"
+    (folder / "episodes.csv").unlink()
+    assert run(*arguments).out.splitlines()[-1] == "trained=0 evaluated=1 reused=1"
+    assert {path: path.read_bytes() for path in (results / "tables").iterdir()} == tables
+    listed = run("tables", "--grid", "smoke", "--out", results)
+    assert (listed.code, sorted(map(Path, listed.out.split()))) == (0, sorted(tables))
+    (folder / "episodes.csv").write_text("edited")
+    for damaged in (run("tables", "--grid", "smoke", "--out", results), run(*arguments)):
+        assert damaged.code == 3
+        assert "episodes.csv: changed since it was written" in damaged.err
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_reproduce_tables_fails_if_a_run_does_and_still_renders(run: Run, tmp_path: Path) -> None:
+    done = run("reproduce-tables", "--grid", grid(tmp_path, [0, 7]), "--out", tmp_path / "results")
+    assert done.code == 1
+    assert done.out.splitlines()[-1] == "trained=1 evaluated=0 reused=0"
+    assert "failed: ours ratio1.1_n3_m1_random seed7" in done.err
+
+
+@pytest.mark.parametrize("name", ["sweep", "tables", "reproduce-tables"])
+def test_an_unknown_grid_ends_with_2_and_leaves_nothing(run: Run, tmp_path: Path, name: str) -> None:
+    before = everything_in(tmp_path)
+    done = run("sweep", "smok") if name == "sweep" else run(name, "--grid", "smok")
+    assert done.code == 2
+    assert "did you mean smoke?" in done.err
+    assert everything_in(tmp_path) == before
+
+
+# config
+
+
+def test_config_show_prints_terms_and_weights_and_every_section(run: Run) -> None:
+    out = run("config", "show", "--reward", "ma2019", "--pursuers", "4").out
+    for text in ("ma2019: closure pursuers, one stage, scale 0.05", "encirclement_radius", "radius=0.15"):
+        assert text in out
+    for section in ("scenario", "algorithm", "training", "evaluation", "learning_rate", "safety_distance"):
+        assert section in out
+    assert "overall_angle" not in out
+    assert "methods: ma2019, model_a, model_b, model_c, ours" in out
+
+
+def test_config_show_as_json_is_the_resolved_configuration(run: Run) -> None:
+    done = run("config", "show", "--profile", "smoke", "--obstacles", "2", "--set", "training.n_worlds=3", "--json")
+    expected = load_config(profile="smoke", scenario={"obstacles": 2}, overrides=["training.n_worlds=3"])
+    assert json.loads(done.out) == expected.to_dict()
+
+
+def test_config_diff_says_what_differs_and_where(run: Run) -> None:
+    assert run("config", "diff", "ours", "model_b").out.splitlines() == [
+        "reward.name: ours in ours, model_b in model_b",
+        "reward.two_stage: True in ours, False in model_b",
+    ]
+    assert run("config", "diff", "ours", "ours").out == ""
+
+
+def test_config_validate_says_valid_or_what_is_wrong(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: ours\nterms: {contraction: 2.0}\n")
+    assert run("config", "validate", path) == (0, "valid\n", "")
+    path.write_text("base: ours\nterms: {contration: 2.0}\n")
+    done = run("config", "validate", path)
+    assert (done.code, done.out) == (2, "")
+    assert "reward.terms.contration: unknown reward term; did you mean contraction?" in done.err
+
+
+def test_every_command_says_what_it_does(run: Run) -> None:
+    names = ("train", "evaluate", "sweep", "tables", "reproduce-tables", "bench", "config")
+    listing = run("--help")
+    assert listing.code == 0
+    for name in names:
+        assert name in listing.out
+        assert run(name, "--help").code == 0
+
+
+def test_bench_outside_a_checkout_says_so(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cli, "PACKAGE", tmp_path / "site-packages" / "marl_encircle")
+    done = run("bench")
+    assert done.code == 2
+    assert "bench needs a checkout" in done.err
+
+
+def test_the_module_is_the_command(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "marl_encircle.cli", "config", "validate", "our"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: reward 'our': no such name, and no path of a .yaml file; did you mean ours?\n"
