@@ -223,6 +223,8 @@ def move_target(
         fx, fy = repulsion(seen, target[b], discs[b], physics)
     elif physics.target == 1:
         fx, fy = still(seen, target[b], discs[b], physics)
+    else:
+        raise ValueError("a name in TARGETS has no branch in move_target")
     force = np.sqrt(fx * fx + fy * fy)
     if force > 0.0:
         stride = speed_ratio * physics.max_speed * physics.time_step / physics.path_samples

@@ -23,6 +23,7 @@ from marl_encircle.core.dynamics import Physics
 Array = NDArray[np.float64]
 
 Closure = Literal["all", "pursuers"]
+"""Who counts for the enclosure: pursuers and obstacles, or the pursuers alone."""
 
 TINY = 1e-12
 """Least distance [scene units], and least d^2 - R^2, that is told from contact."""

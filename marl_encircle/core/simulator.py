@@ -38,7 +38,7 @@ class State(NamedTuple):
     discs: Array
     """x, y, radius of the discs that obstacles consist of [scene units], (B, D, 3)."""
     obstacles: Array
-    """Centres of the obstacles [scene units], (B, M, 2)."""
+    """Centres of the placed obstacles [scene units], (B, ``scenario.obstacles``, 2)."""
     speed_ratio: Array
     """lambda of each world's present round, (B,)."""
     safety_distance: Array

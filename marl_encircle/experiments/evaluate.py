@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from marl_encircle.core.observations import layout, observe
-from marl_encircle.core.rewards import Reward, Transition
-from marl_encircle.core.rounds import NEVER, Rounds
+from marl_encircle.core.rewards import Reward
+from marl_encircle.core.rounds import NEVER
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.core.simulator import Simulator, world_seeds
+from marl_encircle.core.simulator import world_seeds
+from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.records import Episode
 from marl_encircle.maddpg.policies import MADDPGPolicy
@@ -39,19 +39,13 @@ def play_rounds(policy: MADDPGPolicy, config: Config, episodes: int, seed: int) 
 def _play(
     policy: MADDPGPolicy, scenario: Scenario, reward: Reward, seeds: Sequence[int], first_round: int
 ) -> list[Episode]:
-    n_worlds, n = len(seeds), scenario.pursuers
-    simulator = Simulator(scenario, n_worlds)
-    simulator.seed(seeds)
-    simulator.reset()
-    rounds = Rounds(scenario, reward.closure, n_worlds)
-    observations = np.empty((n_worlds, n, list(layout(scenario).values())[-1].stop), np.float32)
+    arena = Arena(scenario, reward, len(seeds))
+    arena.simulator.seed(seeds)
+    observations = arena.reset()
     for _ in range(scenario.max_cycles):
-        observe(simulator, observations)
-        slots, _ = policy.predict(observations.reshape(n_worlds * n, -1), deterministic=True)
-        actions = np.asarray(slots).reshape(n_worlds, n, 2)
-        measure = simulator.step(actions)
-        transition = Transition(scenario, simulator.state, actions, measure, simulator.former_measure, reward.closure)
-        rounds.add(simulator.steps, measure, reward.parts(transition))
+        slots, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
+        observations = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE)).observations
+    rounds = arena.rounds
     steps = np.stack(list(rounds.success_step.values()))
     length = np.where((steps != NEVER).all(axis=0), steps.max(axis=0), scenario.max_cycles)
     sigma_c = rounds.contribution_spread
@@ -67,7 +61,7 @@ def _play(
             contacts_pursuers=int(rounds.contacts_pursuers[b]),
             contacts_obstacles=int(rounds.contacts_obstacles[b]),
         )
-        for b in range(n_worlds)
+        for b in range(len(seeds))
     ]
 
 

@@ -27,7 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from marl_encircle.experiments.records import Closure, Episode
+from marl_encircle.core.geometry import Closure
+from marl_encircle.experiments.records import Episode
 
 CONFIDENCE = 0.95
 UNBOUNDED = (-math.inf, math.inf)

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_type_hints
 
 from marl_encircle import files
-
-Closure = Literal["all", "pursuers"]
-"""Who counts for the enclosure: pursuers and obstacles, or the pursuers alone."""
+from marl_encircle.core.geometry import Closure
 
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
@@ -28,11 +26,12 @@ class Episode(NamedTuple):
     :param step_all: first step, from 1, at which the target was enclosed by pursuers and obstacles with R_m below its
         threshold; None if never
     :param step_pursuers: the same for an enclosure by the pursuers alone
-    :param length: steps played
+    :param length: steps until both rules have held, else the time limit; what follows stops at the method's own success
     :param return_mean: return of the round, mean over the pursuers
-    :param sigma_c: Eq. 15, population standard deviation over the pursuers of their mean contributing angle [rad]
-    :param contacts_pursuers: contacts between pursuers in the round
-    :param contacts_obstacles: contacts of pursuers with obstacles in the round
+    :param sigma_c: Eq. 15, population standard deviation over the pursuers of their mean contributing angle [rad],
+        under the method's own closure rule
+    :param contacts_pursuers: sum over steps and pursuers of the other pursuers touched (a pair counts twice a step)
+    :param contacts_obstacles: the same of obstacles' discs
     """
 
     round: int

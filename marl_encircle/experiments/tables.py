@@ -9,9 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from typing import NamedTuple
 
+from marl_encircle.core.geometry import Closure
 from marl_encircle.experiments import metrics
 from marl_encircle.experiments.metrics import Difference, Estimate
-from marl_encircle.experiments.records import Cell, Closure, Episode, Run, Setting, Status
+from marl_encircle.experiments.records import Cell, Episode, Run, Setting, Status
 
 LABELS = {"ma2019": "Ma", "model_a": "Model A", "model_b": "Model B", "model_c": "Model C", "ours": "Ours"}
 TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
@@ -252,6 +253,8 @@ def _listed(seeds: Iterable[int]) -> str:
 def _result_record(row: _ResultRow) -> dict[str, str]:
     """Write a row in CSV: empty where there is nothing."""
     summary, runs = row.summary, row.runs
+    # sigma_c is recorded under the method's own rule, up to its own success: the other rule has none.
+    own = summary if runs and row.closure == runs.closure else None
     return {
         "method": row.cell.method,
         **_setting_record(row.cell.setting),
@@ -259,8 +262,8 @@ def _result_record(row: _ResultRow) -> dict[str, str]:
         "result": "not run" if runs is None else "run" if summary else runs.in_words,
         **_estimate_record("success_percent", summary and summary.success, 100),
         **_estimate_record("mean_episode_length", summary and summary.mean_episode_length, 1),
-        **_estimate_record("sigma_c", summary and summary.sigma_c, 1),
-        **_estimate_record("sigma_c_solved", summary and summary.sigma_c_solved, 1),
+        **_estimate_record("sigma_c", own and own.sigma_c, 1),
+        **_estimate_record("sigma_c_solved", own and own.sigma_c_solved, 1),
         "seeds": str(len(runs.finished) if runs else 0),
         "training_seeds": _listed(runs.finished) if runs else "",
         **{status.replace(" ", "_"): str(len(runs.others[status]) if runs else 0) for status in OTHER_STATUSES},

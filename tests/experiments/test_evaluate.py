@@ -78,13 +78,13 @@ def test_rounds_are_played_at_the_final_difficulty_without_noise_and_without_a_t
 
 def test_rounds_are_measured_in_the_evaluations_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    simulator = evaluate.Simulator
+    arena = evaluate.Arena
 
-    def noting(scenario: Any, n_worlds: int) -> Any:
+    def noting(scenario: Any, *rest: Any) -> Any:
         seen.append(scenario.n_directions)
-        return simulator(scenario, n_worlds)
+        return arena(scenario, *rest)
 
-    monkeypatch.setattr(evaluate, "Simulator", noting)
+    monkeypatch.setattr(evaluate, "Arena", noting)
     play(tiny(overrides=["evaluation.n_directions=180", "scenario.n_directions=36"]), 1)
     assert seen == [180]
 
