@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -428,11 +429,11 @@ def test_a_real_learning_rate_that_is_too_large_diverges_or_ends(tmp_path: Path)
     assert read_record(folder)["status"] == "diverged"
 
 
-def test_many_runs_leave_no_open_files(tmp_path: Path) -> None:
+def test_many_runs_leave_no_open_files_and_no_threads(tmp_path: Path) -> None:
     config = tiny(overrides=["training.world_steps=16"])
 
-    def count() -> int:
-        return len(list(Path("/proc/self/fd").iterdir()))
+    def count() -> tuple[int, int]:
+        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
 
     train.train(config, 99, "native", tmp_path, tensorboard=True)
     gc.collect()
