@@ -13,12 +13,13 @@ SEED        ?= 0
 JOBS        ?= $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 GRID        ?= committed
 RESULTS     ?= results
-RUN         ?= $(RESULTS)/runs/$(basename $(notdir $(REWARD)))/ratio$(SPEED_RATIO)_n$(PURSUERS)_m$(OBSTACLES)_$(SCENE)/seed$(SEED)
 
 BIN    := .venv/bin
 PYTHON := $(BIN)/python
 CLI    := $(BIN)/marl-encircle
 READY  := .venv/.ready
+TRAIN   = $(CLI) train --reward $(REWARD) --speed-ratio $(SPEED_RATIO) --pursuers $(PURSUERS) \
+          --obstacles $(OBSTACLES) --scene $(SCENE) --seed $(SEED) --out $(RESULTS)/runs
 
 # One thread per process: runs are parallel by process, and results are promised per thread count.
 export OMP_NUM_THREADS := 1
@@ -68,11 +69,10 @@ spelling: $(READY)  ## codespell
 	$(BIN)/codespell
 
 train: $(READY)  ## one training run: REWARD SPEED_RATIO PURSUERS OBSTACLES SCENE SEED RESULTS
-	$(CLI) train --reward $(REWARD) --speed-ratio $(SPEED_RATIO) --pursuers $(PURSUERS) --obstacles $(OBSTACLES) \
-	  --scene $(SCENE) --seed $(SEED) --out $(RESULTS)/runs
+	$(TRAIN)
 
-evaluate: $(READY)  ## evaluate that run, or RUN=its folder
-	$(CLI) evaluate $(RUN)
+evaluate: $(READY)  ## fresh rounds of that run (trained first if it is missing), or of RUN=its folder
+	$(CLI) evaluate $(or $(RUN),"$$($(TRAIN) | tail -n 1)")
 
 sweep: $(READY)  ## train and evaluate what is missing of GRID: GRID JOBS RESULTS
 	$(CLI) sweep $(GRID) --jobs $(JOBS) --out $(RESULTS)/runs
