@@ -47,7 +47,10 @@ def test_variables_reach_the_command() -> None:
         "train --reward my/own.yaml --speed-ratio 1.3 --pursuers 4 --obstacles 2"
         " --scene tunnel --seed 7 --out results/runs"
     )
-    shown = make("-n", "evaluate", "REWARD=my/own.yaml", "SPEED_RATIO=1.3", "SEED=7", "RESULTS=elsewhere")
-    assert shown.strip().endswith("evaluate elsewhere/runs/own/ratio1.3_n3_m1_random/seed7")
+    shown = make("-n", "evaluate", "RUN=elsewhere/seed7")
+    assert shown.strip().endswith("evaluate elsewhere/seed7")
+    shown = " ".join(make("-n", "evaluate", "SPEED_RATIO=1.10", "RESULTS=elsewhere").split())
+    assert "--speed-ratio 1.10" in shown  # the command knows where that run lies
+    assert shown.endswith('--out elsewhere/runs | tail -n 1)"')
     shown = make("-n", "reproduce-tables", "GRID=smoke", "RESULTS=elsewhere", "JOBS=3")
     assert shown.strip().endswith("reproduce-tables --grid smoke --out elsewhere --jobs 3")
