@@ -19,12 +19,13 @@ from rich.table import Table
 
 from marl_encircle import files
 from marl_encircle.core.simulator import PlacementError
-from marl_encircle.experiments.build import Engine, load_run, read_record
+from marl_encircle.experiments.build import Engine, load_run
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import PACKAGE, Config, Profile, difference, load_config, reward_names
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.reproduce import reproduce, write_tables
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import train, write_episodes

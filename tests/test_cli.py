@@ -237,7 +237,7 @@ def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, 
     [
         ("policy.safetensors", b"x", "policy.safetensors: changed since it was written"),
         ("policy.safetensors", None, "policy.safetensors: the file is missing"),
-        ("run.json", b"{", "run.json: is no JSON"),
+        ("run.json", b"{", "run.json: is not valid JSON"),
         ("run.json", b"{}", "run.json"),
         ("run.json", None, "run.json: the file is missing"),
     ],

@@ -1,6 +1,5 @@
 """Configuration -> objects: the environment that trains, the model, and a trained policy read back."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +22,7 @@ from marl_encircle.experiments.config import (
     Schedule,
     load_config,
 )
+from marl_encircle.experiments.records import read_record
 from marl_encircle.maddpg import MADDPG, MATD3
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -166,11 +166,8 @@ def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, An
     folder = Path(run_folder)
     record = read_record(folder)
     path = folder / "policy.safetensors"
-    try:
-        config = config_of(record, folder)
-        data = files.read_bytes(path, sha256=record["sha256"]["policy.safetensors"], max_bytes=MAX_POLICY_BYTES)
-    except (KeyError, TypeError) as error:
-        raise files.DamagedFileError(folder / "run.json", f"has no {error}") from error
+    config = config_of(record, folder)
+    data = files.read_bytes(path, sha256=record["sha256"]["policy.safetensors"], max_bytes=MAX_POLICY_BYTES)
     policy = build_policy(config)
     try:
         tensors = safetensors.torch.load(data)
@@ -186,25 +183,10 @@ def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, An
     return policy, config, record
 
 
-def read_record(folder: Path) -> dict[str, Any]:
-    """Return the ``run.json`` of a run folder.
-
-    :raises DamagedFileError: if it is missing (the run is unfinished) or no JSON object
-    """
-    path = folder / "run.json"
-    try:
-        record = json.loads(files.read_bytes(path, max_bytes=1 << 20))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise files.DamagedFileError(path, f"is no JSON: {error}") from error
-    if not isinstance(record, dict):
-        raise files.DamagedFileError(path, "is no JSON object")
-    return record
-
-
 def config_of(record: dict[str, Any], folder: Path) -> Config:
     """Return the configuration that the run of a folder was made with.
 
-    :raises DamagedFileError: if it is no valid configuration
+    :raises DamagedFileError: if it is not a valid configuration
     """
     try:
         return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything

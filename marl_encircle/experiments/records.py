@@ -5,10 +5,10 @@ import io
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_type_hints
+from typing import Any, Literal, NamedTuple, cast, get_type_hints
 
 from marl_encircle import files
 from marl_encircle.core.geometry import Closure
@@ -16,6 +16,7 @@ from marl_encircle.core.geometry import Closure
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
 MAX_FILE = 1 << 28
+_RECORD_KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
 
 
 class Episode(NamedTuple):
@@ -114,7 +115,7 @@ def episodes_from_csv(text: str) -> list[Episode]:
 
     :param text: content of the file
     :raises ValueError: for another header, a value of the wrong kind or out of range, with line and column; without
-        rounds; for a round number that comes twice
+        rounds; for a round number that appears twice
     """
     try:
         lines = list(csv.reader(io.StringIO(text)))
@@ -126,7 +127,7 @@ def episodes_from_csv(text: str) -> list[Episode]:
     if not episodes:
         raise ValueError("no rounds")
     if len({episode.round for episode in episodes}) != len(episodes):
-        raise ValueError("a round number comes twice")
+        raise ValueError("a round number appears twice")
     return episodes
 
 
@@ -188,29 +189,25 @@ def _subfolders(folder: Path) -> list[Path]:
 def _setting(folder: Path) -> Setting:
     match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", folder.name)
     if match is None:
-        raise files.DamagedFileError(folder, "the name of a setting's folder is ratio<lambda>_n<n>_m<m>_<scene>")
+        raise files.DamagedFileError(folder, "a setting's folder must be named ratio<lambda>_n<n>_m<m>_<scene>")
     return Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
 
 
 def _seed(folder: Path) -> int:
     match = re.fullmatch(r"seed(\d+)", folder.name)
     if match is None:
-        raise files.DamagedFileError(folder, "the name of a run's folder is seed<number>")
+        raise files.DamagedFileError(folder, "a run's folder must be named seed<number>")
     return int(match[1])
 
 
 def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
     """Read one run folder; without ``run.json``, which is written last, the run is unfinished."""
-    path = folder / "run.json"
-    if not path.exists():
+    if not (folder / "run.json").exists():
         return Run(cell, seed, "unfinished")
-    try:
-        record = json.loads(files.read_bytes(path, max_bytes=MAX_RUN_JSON))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, files.DamagedFileError):
-            raise
-        raise files.DamagedFileError(path, f"not JSON: {error}") from error
-    closure, hashes = _checked(path, record, cell, seed)
+    record = read_record(folder)
+    _check_place(folder / "run.json", record, cell, seed)
+    closure: Closure = record["config"]["reward"]["closure"]
+    hashes = sorted(record["sha256"].items())
     contents = {name: files.read_bytes(folder / name, sha256=value, max_bytes=MAX_FILE) for name, value in hashes}
     if record["status"] == "diverged":
         return Run(cell, seed, "diverged", closure)
@@ -225,35 +222,84 @@ def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
     return Run(cell, seed, "finished", closure, tuple(episodes))
 
 
-def _checked(path: Path, record: Any, cell: Cell, seed: int) -> tuple[Closure, list[tuple[str, str]]]:
-    """Closure rule and hashes of a ``run.json`` that belongs where it lies."""
+def _check_place(path: Path, record: Mapping[str, Any], cell: Cell, seed: int) -> None:
+    """Raise a DamagedFileError unless a ``run.json`` belongs where it lies."""
+    scenario = record["config"]["scenario"]
+    recorded = {f"config.scenario.{key}": (scenario.get(key), value) for key, value in cell.setting._asdict().items()}
+    for key, (value, expected) in {
+        "method": (record["method"], cell.method),
+        "seed": (record["seed"], seed),
+        **recorded,
+    }.items():
+        if value != expected:
+            raise files.DamagedFileError(path, f"{key} is {value!r:.80}, in the folder of {expected!r}")
 
-    def expect(holds: bool, reason: str) -> None:
-        if not holds:
-            raise files.DamagedFileError(path, reason)
 
-    expect(isinstance(record, dict), "not a JSON object")
-    missing = [key for key in ("status", "method", "seed", "config", "sha256") if key not in record]
-    expect(not missing, f"missing: {', '.join(missing)}")
-    for key, expected in (("method", cell.method), ("seed", seed)):
-        expect(record[key] == expected, f"{key} is {record[key]!r:.80}, in the folder of {expected!r}")
-    expect(
-        record["status"] in ("finished", "diverged"), f"status is {record['status']!r:.80}, not finished or diverged"
-    )
-    config = record["config"]
-    expect(isinstance(config, dict) and isinstance(config.get("reward"), dict), "config.reward is missing")
-    scenario = config.get("scenario")
-    for key, expected in cell.setting._asdict().items():
-        if isinstance(scenario, dict) and key in scenario:
-            value = scenario[key]
-            expect(value == expected, f"config.scenario.{key} is {value!r:.80}, in the folder of {expected!r}")
-    closure = config["reward"].get("closure")
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the ``run.json`` of a run folder, its fields and the hash of its configuration checked.
+
+    The configuration itself is only checked as far as the tables depend on it: an older one may lack fields that were
+    added since.
+
+    :raises files.DamagedFileError: if it is missing (the run is unfinished), changed, or not what a run writes
+    """
+    path = folder / "run.json"
+    data = files.read_bytes(path, max_bytes=MAX_RUN_JSON)
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise files.DamagedFileError(path, f"is not valid JSON: {error}") from error
+    reason = _fault(record)
+    if reason is not None:
+        raise files.DamagedFileError(path, reason)
+    return cast(dict[str, Any], record)
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """sha256 of a resolved configuration as plain data, in hexadecimal."""
+    return files.sha256_bytes(json.dumps(config, sort_keys=True).encode())
+
+
+def _fault(record: Any) -> str | None:
+    """Say what is wrong with the content of a ``run.json``; None if nothing is."""
+    if not isinstance(record, dict):
+        return "is not a JSON object"
+    missing = [key for key in _RECORD_KEYS if key not in record]
+    if missing:
+        return f"lacks {', '.join(missing)}"
+    if record["status"] not in ("finished", "diverged"):
+        return f"status is {record['status']!r:.80}, not finished or diverged"
+    if not _is_count(record["seed"], 0):
+        return f"seed is {record['seed']!r:.80}, not a whole number from 0"
+    return _fault_of_config(record["config"], record["config_hash"]) or _fault_of_hashes(record["sha256"])
+
+
+def _fault_of_config(config: Any, recorded_hash: Any) -> str | None:
+    if not isinstance(config, dict):
+        return f"config is {config!r:.80}, not an object"
+    if config_hash(config) != recorded_hash:
+        return f"config has changed since it was written: its hash is {config_hash(config)}, not {recorded_hash!r:.80}"
+    for name in ("reward", "scenario", "evaluation"):
+        if not isinstance(config.get(name), dict):
+            return f"config.{name} is {config.get(name)!r:.80}, not an object"
+    closure, evaluation = config["reward"].get("closure"), config["evaluation"]
     if closure not in ("all", "pursuers"):
-        raise files.DamagedFileError(path, f"config.reward.closure is {closure!r:.80}, not 'all' or 'pursuers'")
-    hashes = record["sha256"]
-    expect(
-        isinstance(hashes, dict) and all(isinstance(value, str) for value in hashes.values()), "sha256 is no mapping"
-    )
+        return f"config.reward.closure is {closure!r:.80}, not all or pursuers"
+    for key, least in (("episodes", 1), ("seed", 0)):
+        if not _is_count(evaluation.get(key), least):
+            return f"config.evaluation.{key} is {evaluation.get(key)!r:.80}, not a whole number from {least}"
+    return None
+
+
+def _fault_of_hashes(hashes: Any) -> str | None:
+    if not isinstance(hashes, dict) or not all(isinstance(value, str) for value in hashes.values()):
+        return f"sha256 is {hashes!r:.80}, not an object of file names and hashes"
     for name in hashes:
-        expect(re.fullmatch(r"\w[\w.-]*", name) is not None, f"sha256 has {name!r:.80}, which is no plain file name")
-    return closure, sorted(hashes.items())
+        if re.fullmatch(r"\w[\w.-]*", name) is None:
+            return f"sha256 has {name!r:.80}, which is not a plain file name"
+    return None if "policy.safetensors" in hashes else "sha256 lacks policy.safetensors"
+
+
+def _is_count(value: Any, least: int) -> bool:
+    """Whether a value is a whole number from ``least``; Python counts True and False among them."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from marl_encircle import files
-from marl_encircle.experiments.build import read_record
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.grid import Job, arguments
+from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 POLL_SECONDS = 0.2

@@ -85,7 +85,7 @@ def render_tables(runs: Iterable[Run], aliases: Mapping[Cell, Cell] | None = Non
     :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart
     :param aliases: cell -> the cell whose runs it shares when it has none of its own
     :return: file name -> text, each table as Markdown and CSV
-    :raises ValueError: when a training seed of a cell comes twice or its runs have different closure rules
+    :raises ValueError: when a training seed of a cell appears twice or its runs have different closure rules
     """
     results = _by_cell(runs, aliases or {})
     paper = paper_results()
@@ -162,7 +162,7 @@ def _by_cell(runs: Iterable[Run], aliases: Mapping[Cell, Cell]) -> dict[Cell, _C
     seen = set()
     for run in sorted(runs, key=lambda run: (run.cell, run.seed)):
         if (run.cell, run.seed) in seen:
-            raise ValueError(f"{_in_words(run.cell)}: training seed {run.seed} comes twice")
+            raise ValueError(f"{_in_words(run.cell)}: training seed {run.seed} appears twice")
         seen.add((run.cell, run.seed))
         entry = results.get(run.cell, _CellRuns(None, {}, {status: [] for status in OTHER_STATUSES}))
         if None not in (run.closure, entry.closure) and run.closure != entry.closure:

@@ -22,7 +22,7 @@ from marl_encircle import files
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint
-from marl_encircle.experiments.build import Engine, build_model, build_vec_env, config_of, policy_bytes, read_record
+from marl_encircle.experiments.build import Engine, build_model, build_vec_env, config_of, policy_bytes
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
     Diverged,
@@ -34,7 +34,7 @@ from marl_encircle.experiments.callbacks import (
 )
 from marl_encircle.experiments.config import PACKAGE, Config, difference
 from marl_encircle.experiments.evaluate import play_rounds
-from marl_encircle.experiments.records import Episode, episodes_to_csv, run_path
+from marl_encircle.experiments.records import Episode, episodes_to_csv, read_record, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1

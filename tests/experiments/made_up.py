@@ -5,7 +5,7 @@ from pathlib import Path
 
 from marl_encircle import files
 from marl_encircle.experiments import records
-from marl_encircle.experiments.records import Cell, Closure, Episode
+from marl_encircle.experiments.records import Cell, Closure, Episode, config_hash
 
 
 def episode(number: int, step_all: int | None, step_pursuers: int | None = None, **other: float) -> Episode:
@@ -35,11 +35,17 @@ def write_run(
         texts["episodes.csv"] = records.episodes_to_csv(episodes)
     for name, text in texts.items():
         files.write_text(run / name, text)
+    config = {
+        "reward": {"name": cell.method, "closure": closure},
+        "scenario": cell.setting._asdict(),
+        "evaluation": {"episodes": len(episodes or ()) or 1, "seed": 1000},
+    }
     record = {
         "schema": 1,
         "status": status,
         "method": cell.method,
-        "config": {"reward": {"name": cell.method, "closure": closure}, "scenario": cell.setting._asdict()},
+        "config": config,
+        "config_hash": config_hash(config),
         "seed": seed,
         "sha256": {name: files.sha256_file(run / name) for name in texts},
     }

@@ -29,6 +29,7 @@ from marl_encircle.experiments.build import (
     policy_bytes,
 )
 from marl_encircle.experiments.config import Schedule, load_config
+from marl_encircle.experiments.records import config_hash
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, MATD3
 
@@ -160,9 +161,11 @@ def test_equal_weights_are_equal_bytes_whatever_the_algorithm(algorithm: str, cr
     assert one == other
 
 
-def edit_record(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def edit_record(folder: Path, change: Callable[[dict[str, Any]], object], vouch: bool = True) -> None:
     record = json.loads((folder / "run.json").read_text())
     change(record)
+    if vouch and "config" in record:
+        record["config_hash"] = config_hash(record["config"])
     (folder / "run.json").write_text(json.dumps(record))
 
 
@@ -182,23 +185,33 @@ def write(name: str, content: bytes) -> Callable[[Path], object]:
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (lambda f: f.rename(f.with_name("gone")), "run.json: the file is missing"),
     "no record": (lambda f: (f / "run.json").unlink(), "run.json: the file is missing"),
-    "empty record": (write("run.json", b""), "run.json: is no JSON"),
-    "half a record": (lambda f: write("run.json", (f / "run.json").read_bytes()[:900])(f), "run.json: is no JSON"),
-    "bytes": (write("run.json", b"\xff\xfe"), "run.json: is no JSON"),
-    "a list": (write("run.json", b"[1]"), "run.json: is no JSON object"),
-    "nested": (write("run.json", b"[" * 100_000), "run.json: is no JSON"),
+    "empty record": (write("run.json", b""), "run.json: is not valid JSON"),
+    "half a record": (
+        lambda f: write("run.json", (f / "run.json").read_bytes()[:900])(f), "run.json: is not valid JSON"),
+    "bytes": (write("run.json", b"\xff\xfe"), "run.json: is not valid JSON"),
+    "a list": (write("run.json", b"[1]"), "run.json: is not a JSON object"),
+    "nested": (write("run.json", b"[" * 100_000), "run.json: is not valid JSON"),
     "large": (write("run.json", b" " * (1 << 20) + b"{}"), "run.json: larger than"),
-    "no config": (lambda f: edit_record(f, lambda r: r.pop("config")), "run.json"),
-    "config a list": (lambda f: edit_record(f, lambda r: r.update(config=[1])), "run.json: config: "),
-    "config null": (lambda f: edit_record(f, lambda r: r.update(config=None)), "run.json: config: "),
-    "scenario a list": (lambda f: edit_record(f, lambda r: r["config"].update(scenario=[1])), "run.json: config: "),
+    "no config": (lambda f: edit_record(f, lambda r: r.pop("config")), "run.json: lacks config"),
+    "config a list": (lambda f: edit_record(f, lambda r: r.update(config=[1])), "run.json: config is [1], not"),
+    "config null": (lambda f: edit_record(f, lambda r: r.update(config=None)), "run.json: config is None"),
+    "scenario a list": (lambda f: edit_record(f, lambda r: r["config"].update(scenario=[1])), "config.scenario is"),
+    "no scenario": (lambda f: edit_record(f, lambda r: r["config"].pop("scenario")), "config.scenario is None"),
+    "an edit": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=0.5), vouch=False),
+        "run.json: config has changed since it was written"),
+    "no seed": (lambda f: edit_record(f, lambda r: r.pop("seed")), "run.json: lacks seed"),
+    "seed null": (lambda f: edit_record(f, lambda r: r.update(seed=None)), "run.json: seed is None, not"),
+    "a status": (lambda f: edit_record(f, lambda r: r.update(status="x")), "run.json: status is 'x', not"),
     "unknown key": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(x=1)), "reward.x: unknown key"),
     "nan": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=math.nan)), "reward.scale: "),
     "huge": (lambda f: edit_record(f, lambda r: r["config"]["algorithm"].update(net_arch=[4096] * 8)), "net_arch: the"),
-    "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json"),
-    "hashes a list": (lambda f: edit_record(f, lambda r: r.update(sha256=[])), "run.json"),
+    "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json: lacks sha256"),
+    "hashes a list": (lambda f: edit_record(f, lambda r: r.update(sha256=[])), "run.json: sha256 is [], not"),
+    "no hash": (
+        lambda f: edit_record(f, lambda r: r["sha256"].pop("policy.safetensors")),
+        "run.json: sha256 lacks policy.safetensors"),
     "hash a number": (
-        lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": 3})), "run.json"),
+        lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": 3})), "run.json: sha256 is"),
     "another hash": (
         lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": "0" * 64})),
         "policy.safetensors: changed since it was written"),

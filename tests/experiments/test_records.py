@@ -9,9 +9,10 @@ from made_up import episode, write_run
 
 from marl_encircle import files
 from marl_encircle.experiments import records
-from marl_encircle.experiments.records import Cell, Run, Setting
+from marl_encircle.experiments.records import Cell, Run, Setting, config_hash
 
 CELL = Cell("ours", Setting(1.1, 3, 1))
+KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
 
 
 def test_episodes_come_back_exactly() -> None:
@@ -46,7 +47,7 @@ def test_numpy_scalars_are_written_like_pythons() -> None:
         ("0,1000,10,", "0,,10,", "line 2, seed: '' is not a whole number"),
         ("0,1000,10,", "-1,1000,10,", "line 2, round: '-1' is out of range"),
         ("-1.5,", "nan,", "line 2, return_mean: 'nan' is out of range"),
-        ("1,1001,", "0,1000,", "a round number comes twice"),
+        ("1,1001,", "0,1000,", "a round number appears twice"),
         ("1000", "9" * 400, "line 2, seed: .* is out of range"),
         ("1000", "1" * 200_000, "not CSV"),
         ("\n0,1000,10,,60,-1.5,0.25,2,0\n1,1001,,,60,-1.5,0.25,2,0", "", "no rounds"),
@@ -102,7 +103,7 @@ def test_files_beside_the_folders_and_hidden_folders_are_not_runs(tmp_path: Path
 @pytest.mark.parametrize("name", ["ours/ratio1.1_n3/seed0", "ours/ratio1.1_n3_m1_random/0", "ours/x/seed0"])
 def test_a_folder_of_another_name_is_an_error_that_names_it(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir(parents=True)
-    with pytest.raises(files.DamagedFileError, match="the name of a"):
+    with pytest.raises(files.DamagedFileError, match="folder must be named"):
         records.read_runs(tmp_path)
 
 
@@ -139,18 +140,40 @@ def test_rounds_that_nobody_vouches_for_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda record: record.pop("sha256"), "missing: sha256"),
-        (lambda record: record.update(status="done"), "status is 'done'"),
+        *((lambda record, key=key: record.pop(key), f"lacks {key}") for key in KEYS),
+        (lambda record: [record.pop(key) for key in KEYS], f"lacks {', '.join(KEYS)}"),
+        (lambda record: record.update(status="done"), "status is 'done', not finished or diverged"),
+        (lambda record: record.update(status=[]), r"status is \[\], not finished or diverged"),
+        (lambda record: record.update(seed=None), "seed is None, not a whole number from 0"),
+        (lambda record: record.update(seed=True), "seed is True, not a whole number from 0"),
+        (lambda record: record.update(seed=-1), "seed is -1, not a whole number from 0"),
+        (lambda record: record.update(seed=0.0), "seed is 0.0, not a whole number from 0"),
         (lambda record: record.update(method="model_b"), "method is 'model_b', in the folder of 'ours'"),
         (lambda record: record.update(seed=1), "seed is 1, in the folder of 0"),
-        (lambda record: record.update(config=[]), "config.reward is missing"),
+        (lambda record: record.update(config=[]), r"config is \[\], not an object"),
+        *(
+            (lambda record, key=key: record["config"].pop(key), f"config.{key} is None, not an object")
+            for key in ("reward", "scenario", "evaluation")
+        ),
+        (lambda record: record["config"]["reward"].pop("closure"), "config.reward.closure is None"),
         (lambda record: record["config"]["reward"].update(closure="any"), "config.reward.closure is 'any'"),
+        (
+            lambda record: record["config"]["evaluation"].update(episodes=0),
+            "config.evaluation.episodes is 0, not a whole number from 1",
+        ),
+        (
+            lambda record: record["config"]["evaluation"].update(seed="1000"),
+            "config.evaluation.seed is '1000', not a whole number from 0",
+        ),
         (
             lambda record: record["config"]["scenario"].update(obstacles=0),
             "config.scenario.obstacles is 0, in the folder of 1",
         ),
-        (lambda record: record.update(sha256={"../../secret": "0"}), "no plain file name"),
-        (lambda record: record.update(sha256={"episodes.csv": 0}), "sha256 is no mapping"),
+        (lambda record: record["config"]["scenario"].pop("scene"), "config.scenario.scene is None, in the folder of"),
+        (lambda record: record.update(sha256=[]), r"sha256 is \[\], not an object of file names and hashes"),
+        (lambda record: record["sha256"].pop("policy.safetensors"), r"sha256 lacks policy\.safetensors"),
+        (lambda record: record["sha256"].update({"../../secret": "0"}), "which is not a plain file name"),
+        (lambda record: record["sha256"].update({"episodes.csv": 0}), "not an object of file names and hashes"),
     ],
 )
 def test_a_run_json_that_does_not_belong_there_is_refused(
@@ -159,13 +182,33 @@ def test_a_run_json_that_does_not_belong_there_is_refused(
     path = write_run(tmp_path, CELL, 0, (episode(0, 10),)) / "run.json"
     record = json.loads(path.read_text())
     change(record)
+    if "config_hash" in record and "config" in record:
+        record["config_hash"] = config_hash(record["config"])
     files.write_json(path, record)
     with pytest.raises(files.DamagedFileError, match=reason) as caught:
         records.read_runs(tmp_path)
     assert caught.value.path == path
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"[" * 100_000, b" " * (1 << 21)])
+@pytest.mark.parametrize("value", ["0" * 64, None, 3])
+def test_a_configuration_that_nobody_vouches_for_is_refused(tmp_path: Path, value: object) -> None:
+    path = write_run(tmp_path, CELL, 0, None) / "run.json"
+    record = json.loads(path.read_text())
+    files.write_json(path, {**record, "config_hash": value})
+    with pytest.raises(files.DamagedFileError, match="config has changed since it was written") as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
+    record["config"]["reward"]["scale"] = 0.5
+    files.write_json(path, record)
+    with pytest.raises(files.DamagedFileError, match="config has changed since it was written"):
+        records.read_runs(tmp_path)
+
+
+def test_the_committed_runs_are_what_they_were() -> None:
+    assert len(records.read_runs(Path(__file__).parents[2] / "results" / "runs")) >= 22
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"[" * 100_000, b"9" * 5000, b" " * (1 << 21)])
 def test_a_run_json_that_is_none_is_refused(tmp_path: Path, data: bytes) -> None:
     path = write_run(tmp_path, CELL, 0, (episode(0, 10),)) / "run.json"
     path.write_bytes(data)

@@ -16,7 +16,7 @@ from tiny_runs import TINY, in_another_process
 from marl_encircle import files
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.records import Setting, config_hash
 from marl_encircle.experiments.sweep import Progress, name_of, sweep
 from marl_encircle.experiments.train import OtherRunError, run_folder
 
@@ -40,7 +40,17 @@ def made_up_worker(monkeypatch: pytest.MonkeyPatch, behave: str) -> None:
 
 def record_text(status: str = "finished") -> str:
     """A record that is right for every job of ``JOBS``, but for its seed."""
-    return json.dumps({"status": status, "config": JOBS[0].config.to_dict(), "engine": "native"})
+    config = JOBS[0].config
+    return json.dumps(
+        {
+            "status": status,
+            "method": "ours",
+            "config": config.to_dict(),
+            "config_hash": config.hash,
+            "engine": "native",
+            "sha256": {"policy.safetensors": "0" * 64},
+        }
+    )
 
 
 def finish(status: str = "finished") -> str:
@@ -102,7 +112,9 @@ def test_a_run_of_another_configuration_is_refused_before_anything_starts(
     made_up_worker(monkeypatch, finish())
     sweep(JOBS[:1], tmp_path, 1)
     path = run_folder(JOBS[0].config, 0, tmp_path) / "run.json"
-    path.write_text(path.read_text().replace('"scale": 0.05', '"scale": 0.5'))
+    record = json.loads(path.read_text())
+    record["config"]["reward"]["scale"] = 0.5
+    path.write_text(json.dumps({**record, "config_hash": config_hash(record["config"])}))
     made_up_worker(monkeypatch, "sys.exit('it was started')")
     with pytest.raises(OtherRunError, match=r"reward\.scale: 0\.05 here, 0\.5 there"):
         sweep(JOBS, tmp_path, 1)

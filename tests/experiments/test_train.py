@@ -35,10 +35,10 @@ from marl_encircle import files
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint, train
-from marl_encircle.experiments.build import Engine, read_record
+from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import episodes_from_csv, read_runs
+from marl_encircle.experiments.records import episodes_from_csv, read_record, read_runs
 from marl_encircle.maddpg import MADDPG, maddpg
 
 ENGINES = get_args(Engine)
