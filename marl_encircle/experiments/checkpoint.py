@@ -36,8 +36,9 @@ def save_tree(path: Path, tree: Mapping[str, Any]) -> None:
     plain = _take_arrays(tree, "", arrays)
     with files.atomic_path(path) as temporary:
         text = json.dumps(plain)
-        metadata = {"tree": text, "sha256": files.sha256_bytes(text.encode())}
-        safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
+        # One entry: safetensors writes several in an order that changes from call to call.
+        checked = f"{files.sha256_bytes(text.encode())} {text}"
+        safetensors.numpy.save_file(arrays, temporary, metadata={"tree": checked})
 
 
 def load_tree(path: Path) -> dict[str, Any]:
@@ -48,10 +49,10 @@ def load_tree(path: Path) -> dict[str, Any]:
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-            metadata = file.metadata()
-        if files.sha256_bytes(metadata["tree"].encode()) != metadata["sha256"]:
+            sha256, _, text = file.metadata()["tree"].partition(" ")
+        if files.sha256_bytes(text.encode()) != sha256:
             raise ValueError("its tree has changed since it was written")
-        restored: dict[str, Any] = _put_arrays(json.loads(metadata["tree"]), arrays)
+        restored: dict[str, Any] = _put_arrays(json.loads(text), arrays)
     except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise files.DamagedFileError(path, f"is no checkpoint: {str(error)[:200]}") from error
     return restored
