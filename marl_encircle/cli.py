@@ -108,13 +108,31 @@ def train_command(
 @app.command()
 def evaluate(
     run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
-    episodes: Annotated[int, typer.Option(min=1, max=10**6, help="Rounds to play.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Evaluation seed.")] = 1000,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, max=10**6, help="Rounds to play. Default: as many as the run's configuration.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Evaluation seed. Default: that of the run's configuration.")
+    ] = None,
     as_json: AsJson = False,
-    write: Annotated[bool, typer.Option("--write", help="Replace the run's episodes.csv.")] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="Replace the episodes.csv of a finished run; only with the defaults.")
+    ] = False,
 ) -> None:
-    """Play fresh rounds with a trained policy, noise off, and print how they ended."""
+    """Play rounds with a trained policy, noise off, and print how they ended."""
     policy, config, record = load_run(run_dir)
+    own_rounds = config.evaluation.episodes, config.evaluation.seed
+    episodes = own_rounds[0] if episodes is None else episodes
+    seed = own_rounds[1] if seed is None else seed
+    if seed == record["seed"]:
+        raise ConfigError(f"--seed {seed} is the run's training seed: it was trained in these worlds; give another one")
+    if write and record["status"] != "finished":
+        raise ConfigError(f"--write is for finished runs; {run_dir}: its status is {record['status']}")
+    if write and (episodes, seed) != own_rounds:
+        flags = f"--episodes {own_rounds[0]} --seed {own_rounds[1]}"
+        raise ConfigError(f"--write keeps the rounds that the run's configuration asks for: {flags}")
+    if record["status"] == "diverged":
+        typer.echo("warning: this run diverged; its policy is the one that its training ended with", err=True)
     rounds = play_rounds(policy, config, episodes, seed)
     closure = config.reward.closure
     own = summarise_run(rounds, closure)

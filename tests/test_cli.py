@@ -212,7 +212,7 @@ def test_evaluate_prints_one_object_and_reads_only(run: Run) -> None:
 
 
 def test_the_length_is_null_without_success(run: Run) -> None:
-    for seed in range(100):
+    for seed in range(1, 100):  # 0 is the training seed
         result = json.loads(run("evaluate", finished(), "--episodes", "1", "--seed", seed, "--json").out)
         assert (result["mean_episode_length"] is None) == (result["success"] == 0)
         if result["success"] == 0:
@@ -220,16 +220,55 @@ def test_the_length_is_null_without_success(run: Run) -> None:
     pytest.fail("beginners cannot be that good")
 
 
+def test_evaluate_plays_the_runs_own_rounds_unless_told_otherwise(run: Run) -> None:
+    done = run("evaluate", finished(), "--json")
+    assert done == run("evaluate", finished(), "--episodes", "8", "--seed", "1000", "--json")
+    result = json.loads(done.out)
+    assert (result["episodes"], result["eval_seed"], done.err) == (8, 1000, "")
+
+
 def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, runs: Path) -> None:
     folder = copy_of_finished(runs)
     before = (folder / "episodes.csv").read_bytes()
-    assert run("evaluate", folder, "--episodes", "8", "--write", "--json").code == 0
-    assert (folder / "episodes.csv").read_bytes() == before, "1000 is the configuration's seed too"
-    assert run("evaluate", folder, "--episodes", "9", "--seed", "4", "--write").code == 0
-    assert len((folder / "episodes.csv").read_text().splitlines()) == 10
+    for arguments in ((), ("--episodes", "8", "--seed", "1000")):
+        (folder / "episodes.csv").unlink()
+        assert run("evaluate", folder, *arguments, "--write", "--json").code == 0
+        assert (folder / "episodes.csv").read_bytes() == before
     record = json.loads((folder / "run.json").read_text())
     assert record["sha256"]["episodes.csv"] == files.sha256_file(folder / "episodes.csv")
     assert everything_in(folder) == everything_in(finished())
+
+
+@pytest.mark.parametrize("arguments", [["--episodes", "9"], ["--episodes", "7"], ["--seed", "4"]])
+def test_other_rounds_than_the_runs_own_are_not_written(run: Run, runs: Path, arguments: list[str]) -> None:
+    folder = copy_of_finished(runs)
+    before = contents(folder), (folder / "run.json").read_bytes()
+    done = run("evaluate", folder, *arguments, "--write")
+    assert (done.code, done.out) == (2, "")
+    assert "--write keeps the rounds that the run's configuration asks for: --episodes 8 --seed 1000" in done.err
+    assert (contents(folder), (folder / "run.json").read_bytes()) == before
+
+
+def test_the_worlds_that_a_run_was_trained_in_are_no_evaluation(run: Run) -> None:
+    done = run("evaluate", finished(), "--seed", "0", "--json")
+    assert (done.code, done.out) == (2, "")
+    assert "--seed 0 is the run's training seed" in done.err
+
+
+def test_a_diverged_run_is_evaluated_with_a_warning_and_not_written(run: Run, runs: Path) -> None:
+    folder = copy_of_finished(runs)
+    record = json.loads((folder / "run.json").read_text())
+    del record["sha256"]["episodes.csv"]
+    (folder / "episodes.csv").unlink()
+    files.write_json(folder / "run.json", {**record, "status": "diverged"})
+    before = everything_in(folder), (folder / "run.json").read_bytes()
+    done = run("evaluate", folder, "--json")
+    assert (done.code, list(json.loads(done.out))) == (0, KEYS)
+    assert "warning: this run diverged" in done.err
+    done = run("evaluate", folder, "--write")
+    assert (done.code, done.out) == (2, "")
+    assert "its status is diverged" in done.err
+    assert (everything_in(folder), (folder / "run.json").read_bytes()) == before
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, cast, get_type_hints
 
 from marl_encircle import files
 from marl_encircle.core.geometry import Closure
+from marl_encircle.core.simulator import world_seeds
 
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
@@ -219,7 +220,18 @@ def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
         episodes = episodes_from_csv(contents["episodes.csv"].decode("utf-8"))
     except ValueError as error:
         raise files.DamagedFileError(folder / "episodes.csv", str(error)) from error
+    asked, seed_of_rounds = record["config"]["evaluation"]["episodes"], record["config"]["evaluation"]["seed"]
+    if not _are_rounds(episodes, asked, seed_of_rounds):
+        reason = f"its {len(episodes)} rounds are not rounds 0 to {asked - 1} of evaluation seed {seed_of_rounds}"
+        raise files.DamagedFileError(folder / "episodes.csv", f"{reason}, which the run's configuration asks for")
     return Run(cell, seed, "finished", closure, tuple(episodes))
+
+
+def _are_rounds(episodes: Sequence[Episode], n: int, seed: int) -> bool:
+    """Whether these are the first n rounds of an evaluation seed, in order."""
+    if len(episodes) != n:  # first, since n may be as large as somebody likes
+        return False
+    return [(episode.round, episode.seed) for episode in episodes] == list(enumerate(world_seeds(seed, n)))
 
 
 def _check_place(path: Path, record: Mapping[str, Any], cell: Cell, seed: int) -> None:

@@ -4,14 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from marl_encircle import files
+from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments import records
 from marl_encircle.experiments.records import Cell, Closure, Episode, config_hash
+
+SEEDS = world_seeds(1000, 1000)
+"""Of the rounds of evaluation seed 1000."""
 
 
 def episode(number: int, step_all: int | None, step_pursuers: int | None = None, **other: float) -> Episode:
     """A round; everything that a test does not name has a plain value."""
     values = {"length": 60, "return_mean": -1.5, "sigma_c": 0.25, "contacts_pursuers": 2, "contacts_obstacles": 0}
-    return Episode(number, 1000 + number, step_all, step_pursuers, **(values | other))  # type: ignore[arg-type]
+    seeded = {"seed": SEEDS[number], **values, **other}
+    return Episode(number, step_all=step_all, step_pursuers=step_pursuers, **seeded)  # type: ignore[arg-type]
 
 
 def rounds(successes: int, total: int, step: int = 20, offset: int = 0) -> list[Episode]:
@@ -27,8 +32,9 @@ def write_run(
     episodes: Sequence[Episode] | None,
     closure: Closure = "all",
     status: str = "finished",
+    n_rounds: int | None = None,
 ) -> Path:
-    """Write a run folder; None leaves the rounds out. Returns the run's folder."""
+    """Write a run folder; None leaves the rounds out, ``n_rounds`` asks for other ones. Returns the run's folder."""
     run = folder / records.run_path(cell, seed)
     texts = {"policy.safetensors": f"weights {seed}\n", "progress.csv": "world_steps,success\n0,0.0\n"}
     if episodes is not None:
@@ -38,7 +44,7 @@ def write_run(
     config = {
         "reward": {"name": cell.method, "closure": closure},
         "scenario": cell.setting._asdict(),
-        "evaluation": {"episodes": len(episodes or ()) or 1, "seed": 1000},
+        "evaluation": {"episodes": n_rounds or len(episodes or ()) or 1, "seed": 1000},
     }
     record = {
         "schema": 1,

@@ -8,8 +8,9 @@ import pytest
 from made_up import episode, write_run
 
 from marl_encircle import files
+from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments import records
-from marl_encircle.experiments.records import Cell, Run, Setting, config_hash
+from marl_encircle.experiments.records import Cell, Episode, Run, Setting, config_hash
 
 CELL = Cell("ours", Setting(1.1, 3, 1))
 KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
@@ -17,8 +18,8 @@ KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
 
 def test_episodes_come_back_exactly() -> None:
     episodes = [
-        episode(0, 10, None, return_mean=0.1 + 0.2, sigma_c=1e-17),
-        episode(1, None, 60, return_mean=-123456.789, sigma_c=0.0),
+        episode(0, 10, None, seed=1000, return_mean=0.1 + 0.2, sigma_c=1e-17),
+        episode(1, None, 60, seed=1001, return_mean=-123456.789, sigma_c=0.0),
     ]
     text = records.episodes_to_csv(episodes)
     assert records.episodes_from_csv(text) == episodes
@@ -54,7 +55,7 @@ def test_numpy_scalars_are_written_like_pythons() -> None:
     ],
 )
 def test_a_row_that_cannot_be_is_refused_by_line_and_column(old: str, new: str, where: str) -> None:
-    text = records.episodes_to_csv([episode(0, 10), episode(1, None)])
+    text = records.episodes_to_csv([episode(0, 10, seed=1000), episode(1, None, seed=1001)])
     assert old in text
     with pytest.raises(ValueError, match=where):
         records.episodes_from_csv(text.replace(old, new, 1))
@@ -128,6 +129,31 @@ def test_a_missing_file_is_found(tmp_path: Path) -> None:
     with pytest.raises(files.DamagedFileError, match="missing") as caught:
         records.read_runs(tmp_path)
     assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    "rounds",
+    [
+        [episode(0, 10), episode(2, 10)],
+        [episode(1, 10), episode(2, 10)],
+        [episode(1, 10), episode(0, 10)],
+        [episode(0, 10), episode(1, 10, seed=1001)],
+        [episode(number, 10, seed=seed) for number, seed in enumerate(world_seeds(7, 2))],
+        [episode(0, 10)],
+        [episode(0, 10), episode(1, 10), episode(2, 10)],
+    ],
+)
+def test_other_rounds_than_those_of_the_configuration_are_refused(tmp_path: Path, rounds: list[Episode]) -> None:
+    path = write_run(tmp_path, CELL, 0, rounds, n_rounds=2) / "episodes.csv"
+    with pytest.raises(files.DamagedFileError, match="not rounds 0 to 1 of evaluation seed 1000") as caught:
+        records.read_runs(tmp_path)
+    assert caught.value.path == path
+
+
+def test_an_absurd_number_of_rounds_is_refused_at_once(tmp_path: Path) -> None:
+    write_run(tmp_path, CELL, 0, [episode(0, 10)], n_rounds=10**15)
+    with pytest.raises(files.DamagedFileError, match="not rounds 0 to"):
+        records.read_runs(tmp_path)
 
 
 def test_rounds_that_nobody_vouches_for_are_refused(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ import io
 from pathlib import Path
 
 import pytest
-from made_up import episode, rounds, write_run
+from made_up import SEEDS, episode, rounds, write_run
 
 from marl_encircle import files
 from marl_encircle.experiments import records, tables
@@ -235,7 +235,7 @@ def test_an_edited_row_does_not_reach_the_tables(tmp_path: Path) -> None:
     write_study(tmp_path)
     path = tmp_path / records.run_path(Cell("ours", ONE), 1) / "episodes.csv"
     text = path.read_text()
-    path.write_text(text.replace("99,1099,,,60", "99,1099,20,20,60"))
+    path.write_text(text.replace(f"99,{SEEDS[99]},,,60", f"99,{SEEDS[99]},20,20,60"))
     assert path.read_text() != text
     with pytest.raises(files.DamagedFileError) as caught:
         records.read_runs(tmp_path)
