@@ -41,6 +41,7 @@ class EncirclementVecEnv(VecEnv):
         self.n_worlds, self.n_agents = n_worlds, self.scenario.pursuers
         self.agents = list(self.scenario.agents)
         self.render_mode = None
+        self._running = False
         self._arena = Arena(self.scenario, self.terms, n_worlds)
         self.simulator, self.rounds = self._arena.simulator, self._arena.rounds
         super().__init__(
@@ -74,14 +75,19 @@ class EncirclementVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._slots(self._arena.reset())
+        observations = self._arena.reset()
+        self._running = True
+        return self._slots(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for ``step_wait``.
 
         :param actions: one row a slot, in [-1, 1], (B * N, 2)
         :raises ValueError: for a wrong shape
+        :raises RuntimeError: if no round is running
         """
+        if not self._running:
+            raise RuntimeError("no round is running: call reset() first")
         with np.errstate(over="ignore"):  # too large for single precision is infinite, and told by name in step_wait
             actions = np.array(actions, np.float32)
         if actions.shape != (self.num_envs, 2):
@@ -143,6 +149,7 @@ class EncirclementVecEnv(VecEnv):
         :return: the present observations, (B * N, O)
         """
         self._arena.set_state(saved)
+        self._running = True
         return self._slots(self._arena.observe())
 
     def _slots(self, per_world: NDArray[np.float32]) -> NDArray[np.float32]:

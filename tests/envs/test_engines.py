@@ -57,6 +57,16 @@ def play(venv: VecEnv, policy: Chase, n_steps: int) -> Iterator[tuple[np.ndarray
         yield outcome
 
 
+@pytest.mark.parametrize("make", ENGINES)
+def test_no_step_comes_before_the_first_reset(make: Any) -> None:
+    venv = make(Scenario(), Reward(), 2)
+    actions = np.zeros((6, 2), np.float32)
+    with pytest.raises(RuntimeError, match=r"no round is running: call reset\(\) first"):
+        venv.step(actions)
+    venv.reset()
+    venv.step(actions)
+
+
 def assert_equal_infos(native_info: dict[str, Any], info: dict[str, Any], done: bool) -> None:
     if not done:
         # The native engine does not spend time on saying that nothing has happened.
