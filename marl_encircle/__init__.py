@@ -12,17 +12,19 @@ import pettingzoo
 if TYPE_CHECKING:
     from marl_encircle.core.rewards import Reward
     from marl_encircle.core.scenario import Scenario
+    from marl_encircle.envs import encirclement_v0
     from marl_encircle.envs.encirclement_v0 import parallel_env
     from marl_encircle.experiments.build import load_policy, make_vec_env
     from marl_encircle.maddpg import MADDPG, MATD3
 
-__all__ = ["MADDPG", "MATD3", "Reward", "Scenario", "load_policy", "make_vec_env", "parallel_env"]
+__all__ = ["MADDPG", "MATD3", "Reward", "Scenario", "encirclement_v0", "load_policy", "make_vec_env", "parallel_env"]
 
 _HOMES = {
     "MADDPG": "maddpg",
     "MATD3": "maddpg",
     "Reward": "core.rewards",
     "Scenario": "core.scenario",
+    "encirclement_v0": "envs.encirclement_v0",
     "load_policy": "experiments.build",
     "make_vec_env": "experiments.build",
     "parallel_env": "envs.encirclement_v0",
@@ -36,7 +38,8 @@ pettingzoo.register("aec", "marl_encircle/encirclement-v0", f"{_ENVIRONMENT}:env
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home = f"{__name__}.{_HOMES[name]}"
+    return import_module(home) if home.endswith(f".{name}") else getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:

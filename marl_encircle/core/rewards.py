@@ -169,6 +169,8 @@ class Reward:
     def __post_init__(self) -> None:
         if self.closure not in get_args(Closure):
             raise ValueError(f"closure must be one of {', '.join(get_args(Closure))}; got {self.closure!r:.80}")
+        if not isinstance(self.terms, Mapping):
+            raise ValueError(f"terms must be a mapping of terms to their weights; got {self.terms!r:.80}")
         for name, term in self.terms.items():
             if name not in TERMS:
                 raise ValueError(f"terms.{name:.80}: unknown reward term{nearest(name, TERMS)}")

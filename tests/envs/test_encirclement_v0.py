@@ -321,6 +321,8 @@ def test_an_unknown_field_is_an_error_that_names_the_nearest() -> None:
 def test_an_unknown_term_is_an_error_that_names_the_nearest() -> None:
     with pytest.raises(ValueError, match=r"terms\.overal_angle: unknown reward term; did you mean overall_angle\?"):
         parallel_env(terms={"overal_angle": 1.0})
+    with pytest.raises(ValueError, match="terms must be a mapping of terms to their weights; got 'ours'"):
+        parallel_env(terms="ours")  # type: ignore[arg-type]
 
 
 def test_a_value_out_of_range_is_an_error() -> None:
