@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -450,9 +451,31 @@ def test_bench_outside_a_checkout_says_so(run: Run, monkeypatch: pytest.MonkeyPa
     assert "bench needs a checkout" in done.err
 
 
-def test_the_module_is_the_command(tmp_path: Path) -> None:
+def test_the_version_is_the_packages(run: Run) -> None:
+    assert run("--version") == (0, f"marl-encircle {metadata.version('marl-encircle')}\n", "")
+
+
+def test_an_interrupt_while_it_starts_ends_with_130_and_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "torch.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
     done = subprocess.run(
-        [sys.executable, "-m", "marl_encircle.cli", "config", "validate", "our"],
+        [sys.executable, "-m", "marl_encircle", "--version"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_an_interrupt_in_a_command_ends_with_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "load_config", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    done = run("config", "validate", "ours")
+    assert (done.code, done.out) == (130, "")
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("module", ["marl_encircle", "marl_encircle.cli"])
+def test_the_module_is_the_command(tmp_path: Path, module: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, "config", "validate", "our"],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")

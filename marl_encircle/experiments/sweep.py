@@ -107,7 +107,7 @@ def _count(job: Job, out: str | Path, progress: Progress) -> None:
 
 
 def _start(job: Job, out: str | Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "marl_encircle.cli", "train", *arguments(job), "--out", str(out), "--quiet"]
+    command = [sys.executable, "-m", "marl_encircle", "train", *arguments(job), "--out", str(out), "--quiet"]
     # A group of its own: Ctrl-C reaches the sweep alone, which then stops its workers in order.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(

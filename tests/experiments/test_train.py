@@ -199,7 +199,7 @@ def test_with_obstacles_model_a_and_ours_are_not(tmp_path: Path) -> None:
 def test_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
     arguments = ["train", *tiny_arguments("--out", str(tmp_path), "--quiet", "--no-tensorboard")]
     done = subprocess.run(
-        [sys.executable, "-m", "marl_encircle.cli", *arguments],
+        [sys.executable, "-m", "marl_encircle", *arguments],
         env={**os.environ, "PYTHONHASHSEED": "7"}, cwd=tmp_path, capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert contents(Path(done.stdout.splitlines()[-1])) == contents(finished())
