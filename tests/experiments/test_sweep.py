@@ -121,6 +121,13 @@ def test_a_run_of_another_configuration_is_refused_before_anything_starts(
     assert not (tmp_path / ".lock").exists()
 
 
+def test_a_run_of_the_other_engine_is_as_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_up_worker(monkeypatch, finish().replace('"engine": "native"', '"engine": "supersuit"'))
+    assert counts(sweep(JOBS[:1], tmp_path, 1)) == (1, 0, 0, 0, 0, 0)
+    made_up_worker(monkeypatch, "sys.exit('it was started')")
+    assert counts(sweep(JOBS[:1], tmp_path, 1)) == (1, 1, 0, 0, 0, 0)
+
+
 def test_a_second_sweep_on_the_folder_is_refused_by_pid(tmp_path: Path) -> None:
     with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError, match=f"process {os.getpid()} on host"):
         sweep(JOBS, tmp_path, 1)
