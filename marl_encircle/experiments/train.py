@@ -30,6 +30,7 @@ from marl_encircle.experiments.callbacks import (
     LearningCurve,
     ProgressBar,
     RoundLogger,
+    Stopped,
     stop_signals,
 )
 from marl_encircle.experiments.config import PACKAGE, Config, difference
@@ -133,6 +134,7 @@ class _Run:
                     reset_num_timesteps=not curriculum.world_steps,
                 )
                 guard.check()
+                self.save_checkpoint()  # whatever stops what follows, the next start has only that to do
                 curve.add_point()
             except Diverged:
                 status = "diverged"
@@ -142,8 +144,8 @@ class _Run:
                 bar.close()
                 model.logger.close()
                 self.env.close()
-        curve.write()
-        self.record(status)
+            curve.write()
+            self.record(status, caught)
 
     def save_checkpoint(self) -> None:
         """Write everything that the rest depends on."""
@@ -160,13 +162,19 @@ class _Run:
         wall, cpu = time.monotonic() - self._wall, time.process_time() - self._cpu
         return self.wall_seconds + wall, self.cpu_seconds + cpu
 
-    def record(self, status: str) -> None:
-        """Write the policy, its evaluation rounds and, last, the record of the run."""
+    def record(self, status: str, caught: list[int]) -> None:
+        """Write the policy, its evaluation rounds and, last, the record of the run.
+
+        :param caught: signals so far, see :func:`stop_signals`
+        :raises Stopped: if there is one after the rounds; nothing is written then
+        """
         wall, cpu = self.seconds()
         contents = {"policy.safetensors": policy_bytes(self.model.policy)}
         if status == "finished":
             e = self.config.evaluation
             episodes = play_rounds(self.model.policy, self.config, e.episodes, e.seed)
+            if caught:
+                raise Stopped(caught[0])
             contents["episodes.csv"] = episodes_to_csv(episodes).encode()
         for name, data in contents.items():
             files.write_bytes(self.folder / name, data)

@@ -34,7 +34,7 @@ from torch.nn import functional
 from marl_encircle import files
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.envs.curriculum import CurriculumVecEnv
-from marl_encircle.experiments import checkpoint, train
+from marl_encircle.experiments import callbacks, checkpoint, train
 from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config
@@ -246,9 +246,9 @@ def keep_the_end(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     ends: list[dict[str, Any]] = []
     record = train._Run.record
 
-    def keeping(self: Any, status: str) -> None:
+    def keeping(self: Any, *arguments: Any) -> None:
         ends.append(checkpoint.capture(self.model, self.curriculum))
-        record(self, status)
+        record(self, *arguments)
 
     monkeypatch.setattr(train._Run, "record", keeping)
     return ends
@@ -305,6 +305,47 @@ def test_a_training_may_be_stopped_at_every_step(tmp_path: Path, monkeypatch: py
                 train.train(config, 0, "native", tmp_path / "parts")
     folder, _ = train.train(config, 0, "native", tmp_path / "parts")
     assert contents(folder) == contents(whole)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("module", [train, callbacks], ids=["last rounds", "last point of the curve"])
+def test_a_signal_during_the_evaluation_costs_the_evaluation_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, number: int
+) -> None:
+    step_wait, play_rounds, world_steps = CurriculumVecEnv.step_wait, module.play_rounds, 0
+
+    def counting(self: CurriculumVecEnv) -> Any:
+        nonlocal world_steps
+        outcome = step_wait(self)
+        world_steps = self.world_steps
+        return outcome
+
+    def stopping(*arguments: Any) -> Any:
+        if world_steps == 400:
+            os.kill(os.getpid(), number)
+        return play_rounds(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CurriculumVecEnv, "step_wait", counting)
+        patch.setattr(module, "play_rounds", stopping)
+        with pytest.raises(Stopped, match="the same command goes on from here"):
+            train.train(tiny(), 0, "native", tmp_path, tensorboard=True)
+    folder = train.run_folder(tiny(), 0, tmp_path)
+    assert sorted(path.name for path in folder.iterdir() if path.is_file()) == [checkpoint.NAME, "progress.csv"]
+    with monkeypatch.context() as patch:
+        patch.setattr(CurriculumVecEnv, "step_wait", lambda _: pytest.fail("it was trained again"))
+        assert train.train(tiny(), 0, "native", tmp_path, tensorboard=True, progress_bar=True) == (folder, True)
+    assert contents(folder) == contents(finished())
+    assert not (folder / checkpoint.NAME).exists()
+
+
+def test_an_evaluation_that_fails_costs_the_evaluation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "play_rounds", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train.train(tiny(), 0, "native", tmp_path)
+    monkeypatch.setattr(CurriculumVecEnv, "step_wait", lambda _: pytest.fail("it was trained again"))
+    assert contents(train.train(tiny(), 0, "native", tmp_path)[0]) == contents(finished())
 
 
 FORGETFUL: dict[str, Callable[[dict[str, Any]], object]] = {
