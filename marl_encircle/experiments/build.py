@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import numpy as np
 import safetensors.torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from marl_encircle import files
 from marl_encircle.core.observations import bounds
+from marl_encircle.core.rewards import nearest
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -23,17 +25,15 @@ from marl_encircle.experiments.config import (
     load_config,
 )
 from marl_encircle.experiments.records import read_record
-from marl_encircle.maddpg import MADDPG, MATD3
+from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.maddpg import ALGORITHMS, MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 Engine = Literal["native", "supersuit"]
 
-ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3}
-"""Algorithms by the ``name`` in their configuration."""
-
 
 def make_vec_env(
-    reward: str = "ours",
+    reward: str | Path = "ours",
     n_worlds: int = 64,
     *,
     engine: Engine = "native",
@@ -49,7 +49,8 @@ def make_vec_env(
     :param n_worlds: worlds side by side
     :param engine: ``native``, fast, or ``supersuit``, the PettingZoo environment through SuperSuit; equal seeds give
         equal trajectories
-    :param seed: of the worlds; without one they start from fresh entropy
+    :param seed: of the worlds; without one they start from fresh entropy. Those of ``evaluation.seed`` are the rounds
+        that are reported, so train in others
     :param curriculum: start easy and become final over world steps, as the training section says; without it the
         worlds are final from the start, for evaluation
     :param profile: see :func:`marl_encircle.experiments.config.load_config`
@@ -58,6 +59,9 @@ def make_vec_env(
     :raises ConfigError: for an unknown name or a value that is not allowed
     """
     config = load_config(reward, profile=profile, scenario=scenario, overrides=overrides)
+    _check_integer("n_worlds", n_worlds, least=1)
+    if seed is not None:
+        _check_integer("seed", seed, least=0)
     env = build_vec_env(config, n_worlds, engine, curriculum=curriculum)
     if seed is not None:
         env.seed(seed)
@@ -65,7 +69,11 @@ def make_vec_env(
 
 
 def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, curriculum: bool = True) -> VecEnv:
-    """Return the environment that a configuration trains in."""
+    """Return the environment that a configuration trains in.
+
+    :raises ConfigError: for an unknown engine
+    """
+    check_engine(engine)
     scenario, reward = config.scenario, config.reward.build()
     worlds: VecEnv
     if engine == "native":
@@ -78,6 +86,17 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
         if ramp is not None and curriculum
     }
     return VecMonitor(CurriculumVecEnv(worlds, levels))
+
+
+def check_engine(engine: str) -> None:
+    """Raise a ConfigError, naming the nearest, unless there is such an engine."""
+    if engine not in get_args(Engine):
+        raise ConfigError(f"engine {engine!r:.80}: no such engine{nearest(str(engine), get_args(Engine))}")
+
+
+def _check_integer(name: str, value: object, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ConfigError(f"{name} must be an integer of at least {least}; got {value!r:.80}")
 
 
 def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG:

@@ -7,6 +7,7 @@ package's ``configs/<section>/``. A file may name a ``base`` that it changes; ``
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from itertools import pairwise
@@ -14,7 +15,16 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import layout
@@ -22,6 +32,7 @@ from marl_encircle.core.rewards import Reward, nearest
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml, read_yaml
+from marl_encircle.maddpg import ALGORITHMS
 
 PACKAGE = Path(__file__).parent.parent
 
@@ -35,11 +46,24 @@ MAX_POLICY_BYTES = 1 << 26
 
 MAX_BASES = 20
 
+METHOD_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+"""It names a folder and a row of the tables."""
+
 
 def _even(value: int) -> int:
     if value % 2:
         raise ValueError("must be even")
     return value
+
+
+def _known_algorithm(name: str) -> str:
+    if name not in ALGORITHMS:
+        raise ValueError(f"no such algorithm{nearest(name, ALGORITHMS)}")
+    return name
+
+
+def _off_as_empty(value: Any) -> Any:
+    return {} if value is None else value
 
 
 def _as_floats(value: Any) -> Any:
@@ -63,7 +87,7 @@ class Section(BaseModel):
 class RewardConfig(Section):
     """A method: see :class:`marl_encircle.core.rewards.Reward`; ``name`` is the row of the tables."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    name: Annotated[str, Field(pattern=METHOD_NAME)]
     closure: Closure = "all"
     two_stage: bool = True
     scale: float = 0.05
@@ -83,9 +107,9 @@ class Schedule(Section):
 
 
 class AlgorithmConfig(Section):
-    """MADDPG or MATD3. Counts are world steps, one step of all pursuers of one world."""
+    """One of ``ALGORITHMS``. Counts are world steps, one step of all pursuers of one world."""
 
-    name: Literal["maddpg", "matd3"]
+    name: Annotated[str, AfterValidator(_known_algorithm)]
     critic: Literal["per_agent", "shared"]
     net_arch: Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(max_length=8)]
     learning_rate: Annotated[float, Field(gt=0, le=1)]
@@ -110,7 +134,10 @@ class Ramp(Section):
     world_steps: Count
 
 
-Curriculum = dict[Literal["safety_distance", "obstacle_radius", "speed_ratio"], Ramp | None]
+Curriculum = Annotated[
+    dict[Literal["safety_distance", "obstacle_radius", "speed_ratio"], Ramp | None], BeforeValidator(_off_as_empty)
+]
+"""null switches all of it off."""
 
 
 class TrainingConfig(Section):
@@ -130,6 +157,13 @@ class EvaluationConfig(Section):
     curve_episodes: Episodes
     curve_seed: Annotated[int, Field(ge=0, lt=1 << 63)]
     n_directions: Annotated[int, Field(ge=8, le=4096), AfterValidator(_even)]
+
+    @field_validator("curve_seed")
+    @classmethod
+    def _other_rounds(cls, curve_seed: int, info: ValidationInfo) -> int:
+        if curve_seed == info.data.get("seed"):
+            raise ValueError("must differ from evaluation.seed, whose rounds are reported")
+        return curve_seed
 
 
 class Config(Section):
@@ -173,9 +207,9 @@ class Config(Section):
 
 
 def load_config(
-    reward: str = "ours",
+    reward: str | Path = "ours",
     *,
-    algorithm: str = "maddpg",
+    algorithm: str | Path = "maddpg",
     profile: Profile = "full",
     scenario: Mapping[str, Any] | None = None,
     overrides: Sequence[str] = (),
@@ -192,6 +226,7 @@ def load_config(
     :param overrides: ``section.key=value`` each, the value in YAML
     :raises ConfigError: naming file or key, the value, and what is allowed
     """
+    reward, algorithm = os.fspath(reward), os.fspath(algorithm)
     changes = _parse_overrides(overrides)
     fields_of_scenario = merge(_section("scenario", "default"), merge(scenario or {}, changes.get("scenario", {})))
     world = _build_scenario(fields_of_scenario)
@@ -203,9 +238,38 @@ def load_config(
         "evaluation": _section("evaluation", profile),
     }
     merged = {name: merge(section, changes.get(name, {})) for name, section in sections.items()}
-    config = _checked(world, merged)
+    named = merged["reward"].get("name")
+    if named == Path(reward).stem and not re.match(METHOD_NAME, named):
+        raise ConfigError(f"{reward}: {named!r:.80} cannot name a method; add 'name:' with letters, digits, _ . or -")
+    return _checked(world, merged)
+
+
+def check_seed(config: Config, seed: int) -> None:
+    """Refuse a training seed whose worlds are those of the evaluation.
+
+    :raises ConfigError: also if it is no integer from 0 to 2**32 - 1
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 32:
+        raise ConfigError(f"seed must be an integer from 0 to {(1 << 32) - 1}; got {seed!r:.80}")
+    for name in ("seed", "curve_seed"):
+        if seed == getattr(config.evaluation, name):
+            raise ConfigError(
+                f"seed must differ from evaluation.{name}: the training would see the evaluation's rounds; got {seed}"
+            )
+
+
+def check_training(config: Config) -> None:
+    """Refuse a training that would learn nothing or not fit into this machine's memory; an environment may do both.
+
+    :raises ConfigError: naming the keys
+    """
+    random, total = config.algorithm.random_world_steps, config.training.world_steps
+    if random >= total:
+        raise ConfigError(
+            f"algorithm.random_world_steps: nothing would be learnt, as the training ends after {total} world steps "
+            f"(training.world_steps); got {random}"
+        )
     _check_memory(config)
-    return config
 
 
 def reward_names() -> list[str]:
@@ -236,7 +300,7 @@ def _reward_folders() -> list[Path]:
 
 def is_path(name: str) -> bool:
     """Whether a configuration is given by the path of its file, not by name."""
-    return name.endswith((".yaml", ".yml")) or os.sep in name
+    return name.lower().endswith((".yaml", ".yml")) or os.sep in name
 
 
 def _reward(name: str) -> dict[str, Any]:
@@ -299,6 +363,8 @@ def _parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
             value = parse_yaml(text)
         except ConfigError as error:
             raise ConfigError(f"--set {override:.80}: {error}") from error
+        if value == {}:
+            raise ConfigError(f"--set {override:.80}: mappings are merged, so an empty one changes nothing; use null")
         for key in reversed(keys):
             value = {key: value}
         changes = merge(changes, value)
@@ -309,11 +375,13 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
     """Return the configuration of a scenario and the plain values of the other sections."""
     try:
         config = Config(scenario=scenario, **sections)
-        config.reward.build()
+        reward = config.reward.build()
     except ValidationError as error:
         raise ConfigError("\n".join(explain(error, Config))) from error
     except ValueError as error:
         raise ConfigError(f"reward.{error}") from error
+    if not reward.active:
+        raise ConfigError("reward.terms: all are off; at least one needs a weight")
     _check_curriculum(config)
     _check_networks(config)
     return config

@@ -5,7 +5,17 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from marl_encircle.experiments.config import PACKAGE, Config, Profile, Section, explain, find_file, is_path, load_config
+from marl_encircle.experiments.config import (
+    PACKAGE,
+    Config,
+    Profile,
+    Section,
+    check_seed,
+    explain,
+    find_file,
+    is_path,
+    load_config,
+)
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
@@ -86,7 +96,13 @@ def load_grid(name: str) -> Grid:
     for group in grid.groups:
         for method in (str(path.parent / name) if is_path(name) else name for name in group.methods):
             for setting in (Setting(**column.model_dump()) for column in group.settings):
-                cell = _config(method, setting, grid.profile).cell
+                config = _config(method, setting, grid.profile)
+                try:
+                    for seed in group.seeds:
+                        check_seed(config, seed)
+                except ConfigError as error:
+                    raise ConfigError(f"{path}: {error}") from error
+                cell = config.cell
                 owner = _owner(cell, grid.shared)
                 if owner is not None:
                     aliases[cell] = Cell(owner, setting)

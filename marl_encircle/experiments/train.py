@@ -22,7 +22,14 @@ from marl_encircle import files
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint
-from marl_encircle.experiments.build import Engine, build_model, build_vec_env, config_of, policy_bytes
+from marl_encircle.experiments.build import (
+    Engine,
+    build_model,
+    build_vec_env,
+    check_engine,
+    config_of,
+    policy_bytes,
+)
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
     Diverged,
@@ -33,7 +40,7 @@ from marl_encircle.experiments.callbacks import (
     Stopped,
     stop_signals,
 )
-from marl_encircle.experiments.config import PACKAGE, Config, difference
+from marl_encircle.experiments.config import PACKAGE, Config, check_seed, check_training, difference
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.records import Episode, episodes_to_csv, read_record, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -70,15 +77,19 @@ def train(
     :param checkpoint_every: seconds between checkpoints
     :param tensorboard: write event files into the run folder
     :return: the run folder, and whether anything was left to do
+    :raises ConfigError: for a seed or a configuration that cannot be trained, before anything is written
     :raises OtherRunError: if the folder holds a run of another configuration or engine, with the difference
     :raises PlacementError: if the bodies cannot be placed, before anything is written
     :raises Stopped: after SIGINT or SIGTERM, with a checkpoint written
     """
+    check_seed(config, seed)
+    check_engine(engine)
     folder = run_folder(config, seed, out)
     if (folder / "run.json").exists():
         check_same_run(folder, config, seed, engine)
         return folder, False
     plan = _plan(config, seed, engine)
+    check_training(config)
     _check_placement(config)
     with files.folder_lock(folder):
         if (folder / "run.json").exists():  # by whoever had the lock until now

@@ -5,4 +5,7 @@ from marl_encircle.maddpg.maddpg import MADDPG, UntrustedFileWarning
 from marl_encircle.maddpg.matd3 import MATD3
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
-__all__ = ["MADDPG", "MATD3", "JointReplayBuffer", "MADDPGPolicy", "UntrustedFileWarning"]
+__all__ = ["ALGORITHMS", "MADDPG", "MATD3", "JointReplayBuffer", "MADDPGPolicy", "UntrustedFileWarning"]
+
+ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3}
+"""Algorithms by the ``name`` in their configuration."""

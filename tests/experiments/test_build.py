@@ -19,7 +19,6 @@ from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.build import (
-    ALGORITHMS,
     NoiseSchedule,
     build_model,
     build_vec_env,
@@ -31,7 +30,7 @@ from marl_encircle.experiments.build import (
 from marl_encircle.experiments.config import Schedule, load_config
 from marl_encircle.experiments.records import config_hash
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.maddpg import MADDPG, MATD3
+from marl_encircle.maddpg import ALGORITHMS, MADDPG, MATD3
 
 # worlds
 
@@ -78,10 +77,17 @@ def test_equal_seeds_make_equal_worlds_and_none_makes_others() -> None:
 def test_a_users_file_and_overrides_reach_the_worlds(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("base: ours\nterms: {time: 3.0, contraction: null}\n")
-    venv = make_vec_env(str(path), 2, overrides=["reward.scale=0.5"], max_cycles=7)
-    reward = venv.get_attr("terms")[0]
-    assert (reward.scale, reward.terms["time"], venv.get_attr("scenario")[0].max_cycles) == (0.5, 3.0, 7)
-    assert "contraction" not in reward.active
+    for given in (path, str(path)):
+        venv = make_vec_env(given, 2, overrides=["reward.scale=0.5"], max_cycles=7)
+        reward = venv.get_attr("terms")[0]
+        assert (reward.scale, reward.terms["time"], venv.get_attr("scenario")[0].max_cycles) == (0.5, 3.0, 7)
+        assert "contraction" not in reward.active
+
+
+def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
+    assert make_vec_env(n_worlds=1, pursuers=64, pursuer_radius=0.01, obstacles=0).num_envs == 64
+    assert make_vec_env(n_worlds=1, overrides=["training.world_steps=10000000000",
+                                               "algorithm.buffer_world_steps=10000000000"]).num_envs == 3  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -91,9 +97,16 @@ def test_a_users_file_and_overrides_reach_the_worlds(tmp_path: Path) -> None:
         ({"pursuers": "3"}, "scenario.pursuers must be an integer"),
         ({"reward": "our"}, "did you mean ours?"),
         ({"overrides": ["training.n_world=3"]}, "did you mean n_worlds?"),
+        ({"engine": "nativ"}, "engine 'nativ': no such engine; did you mean native?"),
+        ({"engine": None}, "engine None: no such engine; known: native, supersuit"),
+        ({"n_worlds": "8"}, "n_worlds must be an integer of at least 1; got '8'"),
+        ({"n_worlds": 0}, "n_worlds must be an integer of at least 1; got 0"),
+        ({"n_worlds": 2.0}, "n_worlds must be an integer of at least 1; got 2.0"),
+        ({"seed": -1}, "seed must be an integer of at least 0; got -1"),
+        ({"seed": "0"}, "seed must be an integer of at least 0; got '0'"),
     ],
 )
-def test_a_misspelt_argument_names_the_nearest(how: dict[str, Any], reason: str) -> None:
+def test_a_bad_argument_is_told_by_its_name(how: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError) as caught:
         make_vec_env(**how)
     assert reason in str(caught.value)

@@ -9,7 +9,16 @@ from typing import Any
 import pytest
 import yaml_cases
 
-from marl_encircle.experiments.config import Config, difference, load_config, reward_names
+from marl_encircle import maddpg
+from marl_encircle.core.rewards import Reward
+from marl_encircle.experiments.config import (
+    Config,
+    check_seed,
+    check_training,
+    difference,
+    load_config,
+    reward_names,
+)
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.experiments.yaml_files import ConfigError
 
@@ -82,12 +91,28 @@ def test_a_users_file_works_where_a_name_does_from_any_folder(tmp_path: Path, mo
     for path in ("elsewhere/mine.yaml", "./elsewhere/mine.yaml", str(tmp_path / "elsewhere" / "mine.yaml")):
         assert load_config(path) == load_config("ours")
     algorithm = write(tmp_path, "slow.yml", "base: maddpg\nlearning_rate: 1e-4\n")
-    assert load_config(algorithm=algorithm).algorithm.learning_rate == 1e-4
+    for path in (algorithm, Path(algorithm)):
+        assert load_config(algorithm=path).algorithm.learning_rate == 1e-4
+    assert load_config(Path("elsewhere/mine.yaml")) == load_config("ours")
+    write(tmp_path, "LOUD.YAML", "base: ours\n")
+    assert load_config("LOUD.YAML").reward.name == "LOUD"
+
+
+def test_a_file_whose_name_cannot_name_a_method_is_told_to_add_one(tmp_path: Path) -> None:
+    path = write(tmp_path, "my idea.yaml", "base: ours\n")
+    assert refused(path) == f"{path}: 'my idea' cannot name a method; add 'name:' with letters, digits, _ . or -"
+    assert load_config(path, overrides=["reward.name=said"]).reward.name == "said"
+    assert load_config(write(tmp_path, "my idea.yaml", "base: ours\nname: idea\n")).reward.name == "idea"
 
 
 def test_the_installation_knows_the_papers_methods() -> None:
     assert reward_names() == ["ma2019", "model_a", "model_b", "model_c", "ours"]
     assert load_config(algorithm="matd3").algorithm.name == "matd3"
+
+
+def test_an_algorithm_is_known_once_the_registry_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(maddpg.ALGORITHMS, "mine", maddpg.MATD3)
+    assert load_config(overrides=["algorithm.name=mine"]).to_dict()["algorithm"]["name"] == "mine"
 
 
 @pytest.mark.parametrize(
@@ -105,6 +130,13 @@ def test_the_curriculum_follows_from_eq_6_for_every_method_alike(
         assert ramps == ({"safety_distance"} if alone else {"obstacle_radius", "speed_ratio"})
         longer = config.training.world_steps > 1_000_000
         assert longer == (profile == "full" and not alone)
+
+
+def test_null_switches_the_curriculum_off() -> None:
+    for pursuers in (2, 3):
+        config = load_config(scenario={"pursuers": pursuers}, overrides=["training.curriculum=null"])
+        assert config.to_dict()["training"]["curriculum"] == {}
+        assert Config.from_dict(config.to_dict()) == config
 
 
 # one run, one folder, one hash
@@ -229,6 +261,10 @@ def test_the_methods_are_those_of_the_notes() -> None:
     assert load_config("ma2019").reward.build().active["encirclement_radius"][1] == {"radius": 0.15}
 
 
+def test_the_rewards_default_is_the_papers_method() -> None:
+    assert Reward() == load_config("ours").reward.build()
+
+
 def test_methods_differ_in_their_reward_only() -> None:
     for method in reward_names():
         here, there = load_config(method).to_dict(), load_config("ours").to_dict()
@@ -298,11 +334,46 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_what_would_not_fit_into_memory_is_refused(overrides: Sequence[str]) -> None:
-    assert "GB would be needed, this machine has" in refused(overrides=overrides)
+    config = load_config(overrides=overrides)  # which may be shown, and its environment built
+    with pytest.raises(ConfigError, match="GB would be needed, this machine has"):
+        check_training(config)
 
 
 def test_a_buffer_is_no_larger_than_its_training() -> None:
-    load_config(profile="smoke", overrides=["algorithm.buffer_world_steps=10000000000"])
+    check_training(load_config(profile="smoke", overrides=["algorithm.buffer_world_steps=10000000000"]))
+
+
+@pytest.mark.parametrize("profile", ["full", "smoke"])
+@pytest.mark.parametrize("pursuers", [2, 3])
+def test_a_training_without_learning_is_refused(profile: Any, pursuers: int) -> None:
+    def check(random: int) -> None:
+        how = [f"algorithm.random_world_steps={random}", "training.world_steps=12000"]
+        check_training(load_config(profile=profile, scenario={"pursuers": pursuers}, overrides=how))
+
+    check_training(load_config(profile=profile, scenario={"pursuers": pursuers}))
+    check(11999)
+    for random in (12000, 20000):
+        with pytest.raises(ConfigError, match=f"random_world_steps: nothing would be learnt.*12000.*; got {random}"):
+            check(random)
+
+
+@pytest.mark.parametrize(
+    ("seed", "reason"),
+    [
+        (1000, r"seed must differ from evaluation\.seed: the training would see the evaluation's rounds; got 1000"),
+        (2000, r"seed must differ from evaluation\.curve_seed: .*; got 2000"),
+        (-1, "seed must be an integer from 0 to 4294967295; got -1"),
+        (1 << 32, "seed must be an integer from 0 to 4294967295; got 4294967296"),
+        (True, "got True"),
+        (1.0, r"got 1\.0"),
+        ("1", "got '1'"),
+    ],
+)
+def test_a_training_seed_is_none_of_the_evaluations(seed: Any, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        check_seed(load_config(), seed)
+    check_seed(load_config(), 999)
+    check_seed(load_config(overrides=["evaluation.seed=3"]), 1000)
 
 
 @pytest.mark.parametrize(

@@ -121,6 +121,11 @@ def test_a_bad_grid_is_refused_by_key_and_reason(tmp_path: Path, old: str, new: 
     assert reason in str(caught.value)
 
 
+def test_a_seed_of_the_evaluation_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"grid\.yaml: seed must differ from evaluation\.seed: .*; got 1000"):
+        grid_of(tmp_path, GRID.format(method="ours").replace("[2, 3, 2]", "[2, 1000]"))
+
+
 @pytest.mark.parametrize(("name", "reason"), [("al", "did you mean all?"), ("absent.yaml", "No such file")])
 def test_a_grid_that_is_not_there_is_refused(name: str, reason: str) -> None:
     with pytest.raises(ConfigError) as caught:

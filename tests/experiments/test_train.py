@@ -39,6 +39,7 @@ from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.records import episodes_from_csv, read_record, read_runs
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, maddpg
 
 ENGINES = get_args(Engine)
@@ -166,6 +167,25 @@ def test_bodies_that_cannot_be_placed_are_told_before_anything_is_written(
     config = tiny(obstacles=2, overrides=[*crowded, ramp])
     with pytest.raises(PlacementError):
         train.train(config, 0, "native", tmp_path)
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "seed", "engine", "reason"),
+    [
+        ([], 1000, "native", r"seed must differ from evaluation\.seed"),
+        ([], 2000, "native", r"seed must differ from evaluation\.curve_seed"),
+        ([], -1, "native", "seed must be an integer"),
+        ([], 0, "nativ", "did you mean native?"),
+        (["algorithm.random_world_steps=400"], 0, "native", "nothing would be learnt"),
+        (["training.world_steps=10000000000", "algorithm.buffer_world_steps=10000000000"], 0, "native", "GB would be"),
+    ],
+)
+def test_what_cannot_be_trained_is_told_before_anything_is_written(
+    tmp_path: Path, overrides: list[str], seed: int, engine: Any, reason: str
+) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        train.train(tiny(overrides=overrides), seed, engine, tmp_path)
     assert everything_in(tmp_path) == []
 
 
@@ -471,7 +491,7 @@ def test_a_real_learning_rate_that_is_too_large_diverges_or_ends(tmp_path: Path)
 
 
 def test_many_runs_leave_no_open_files_and_no_threads(tmp_path: Path) -> None:
-    config = tiny(overrides=["training.world_steps=16"])
+    config = tiny(overrides=["training.world_steps=16", "algorithm.random_world_steps=8"])
 
     def count() -> tuple[int, int]:
         return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
