@@ -13,9 +13,11 @@ from marl_encircle.experiments import reproduce as reproduction
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import Job, load_grid
+from marl_encircle.experiments.records import config_hash
 from marl_encircle.experiments.reproduce import TABLE1_METHODS, Reproduction, options_of, reproduce, write_tables
 from marl_encircle.experiments.tables import MethodOptions, render_table1
 from marl_encircle.experiments.train import run_folder, train
+from marl_encircle.experiments.yaml_files import ConfigError
 
 TABLES = [
     f"{name}.{kind}"
@@ -126,6 +128,29 @@ def test_runs_that_the_grid_does_not_ask_for_are_not_in_its_tables(tmp_path: Pat
     reproduce("smoke", tmp_path, 1)
     before = tables(tmp_path)
     train(load_grid("smoke").jobs[0].config, 5, "native", tmp_path / "runs")
+    write_tables(load_grid("smoke"), tmp_path)
+    assert tables(tmp_path) == before
+
+
+@pytest.mark.parametrize("status", ["finished", "diverged"])
+def test_a_run_of_another_configuration_is_not_shown(tmp_path: Path, status: str) -> None:
+    reproduce("smoke", tmp_path, 1)
+    before = tables(tmp_path)
+    path = folders(tmp_path)[1] / "run.json"
+    record = json.loads(path.read_text())
+    record["config"]["algorithm"]["gamma"] = 0.5
+    files.write_json(path, {**record, "status": status, "config_hash": config_hash(record["config"])})
+    with pytest.raises(ConfigError, match=r"config\.algorithm\.gamma: 0\.9 here, 0\.5 there") as caught:
+        write_tables(load_grid("smoke"), tmp_path)
+    assert str(path.parent) in str(caught.value)
+    assert tables(tmp_path) == before
+
+
+def test_a_run_of_either_engine_is_shown(tmp_path: Path) -> None:
+    reproduce("smoke", tmp_path, 1)
+    before = tables(tmp_path)
+    path = folders(tmp_path)[0] / "run.json"
+    files.write_json(path, {**json.loads(path.read_text()), "engine": "supersuit"})
     write_tables(load_grid("smoke"), tmp_path)
     assert tables(tmp_path) == before
 
