@@ -11,7 +11,7 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid, load_grid
 from marl_encircle.experiments.records import read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
-from marl_encircle.experiments.tables import MethodOptions, render_table1, render_tables
+from marl_encircle.experiments.tables import OTHER_TABLES, MethodOptions, render_table1, render_tables
 from marl_encircle.experiments.train import check_same_run, run_folder, write_episodes
 
 TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
@@ -54,7 +54,7 @@ def reproduce(
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:
-    """Render Tables 1-4 from the runs of a grid.
+    """Render the tables from the runs of a grid; a former table of other settings goes when there is none now.
 
     :return: the files written
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
@@ -71,6 +71,9 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS})
     texts |= render_tables(runs, grid.aliases)
     folder = Path(results) / "tables"
+    for name in OTHER_TABLES:
+        if name not in texts:
+            (folder / name).unlink(missing_ok=True)
     for name, text in texts.items():
         files.write_text(folder / name, text)
     return [folder / name for name in texts]

@@ -24,21 +24,28 @@ TITLES = {
     "table4": "Table 4: The performance under different numbers of obstacles",
     "table_common_rule": "All methods under the common closure rule: pursuers and obstacles",
 }
+OTHER_TABLES = ("table_other.md", "table_other.csv")
+"""Of the cells that Tables 2-4 have no row for; only where there are such."""
 DASH = "–"  # noqa: RUF001 - the paper's own sign
 OTHER_STATUSES: tuple[Status, ...] = ("diverged", "unfinished", "not evaluated")
 _INTERVAL_NOTE = (
     "Brackets: 95 % interval of the mean over training seeds (Student's t, at least as wide as the noise of the"
     " evaluation rounds). One seed has no interval."
 )
+_SHARE_NOTE = "S %: share of the evaluation rounds that end enclosed."
+_LENGTH_NOTE = "MEL: mean length of the successful rounds, in steps."
+_COUNTED_NOTE = "Diverged, unfinished and not evaluated runs are counted, and are not in the means."
 _RESULT_HEADER = ["Method", "λ", "n", "m", "S %", "MEL", "Paper S % / MEL", "Seeds"]
 _RESULT_NOTES = [
-    "S %: share of the evaluation rounds that end enclosed.",
+    _SHARE_NOTE,
     "Closure: Tables 2-4 take each method's own rule (Ma and Model A: pursuers alone; others: pursuers and obstacles).",
-    "MEL: mean length of the successful rounds, in steps.",
+    _LENGTH_NOTE,
     _INTERVAL_NOTE,
     f"{DASH}: the paper says that the method cannot enclose the target there. Not run: there is no such run here.",
-    "Diverged, unfinished and not evaluated runs are counted, and are not in the means.",
+    _COUNTED_NOTE,
 ]
+_OTHER_HEADER = [*_RESULT_HEADER[:4], "Scene", *_RESULT_HEADER[4:]]
+_OTHER_NOTES = [_SHARE_NOTE, "Closure: each method's own rule.", _LENGTH_NOTE, _INTERVAL_NOTE, _COUNTED_NOTE]
 _DIFFERENCE_HEADER = ["Other method", "λ", "n", "m", "Closure ours / other", "S, points", "MEL, steps", "Seeds"]
 _DIFFERENCE_NOTES = [
     "Ours minus the other method, paired by training seed and evaluation round; MEL over the rounds that both solve.",
@@ -80,7 +87,7 @@ def paper_results() -> dict[str, dict[Cell, PaperResult]]:
 
 
 def render_tables(runs: Iterable[Run], aliases: Mapping[Cell, Cell] | None = None) -> dict[str, str]:
-    """Tables 2-4, the same results under the common closure rule, and the paired differences.
+    """Tables 2-4, the same results under the common closure rule, the paired differences, and other settings' results.
 
     :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart
     :param aliases: cell -> the cell whose runs it shares when it has none of its own
@@ -97,6 +104,12 @@ def render_tables(runs: Iterable[Run], aliases: Mapping[Cell, Cell] | None = Non
         rows = [_result_row(cell, results.get(cell), cells.get(cell), closure) for cell in _ordered(cells, results)]
         rendered[f"{name}.md"] = _markdown(title, _RESULT_HEADER, [_result_cells(row) for row in rows], _RESULT_NOTES)
         rendered[f"{name}.csv"] = _csv([_result_record(row) for row in rows])
+    others = _by_method(results.keys() - set(_ordered(every, results)))
+    if others:
+        rows = [_result_row(cell, results[cell], None, None) for cell in others]
+        title = "Settings that Tables 2-4 do not have"
+        rendered["table_other.md"] = _markdown(title, _OTHER_HEADER, [_other_cells(row) for row in rows], _OTHER_NOTES)
+        rendered["table_other.csv"] = _csv([_result_record(row) for row in rows])
     differences = list(_difference_rows(every, results))
     rendered["table_differences.md"] = _markdown(
         "Ours minus the others", _DIFFERENCE_HEADER, [_difference_cells(row) for row in differences], _DIFFERENCE_NOTES
@@ -188,8 +201,13 @@ def _ordered(paper: Iterable[Cell], results: Iterable[Cell]) -> list[Cell]:
     paper = list(paper)
     settings = {cell.setting for cell in paper}
     others = [cell for cell in results if cell.method not in TABLE_METHODS and cell.setting in settings]
+    return _by_method({*paper, *others})
+
+
+def _by_method(cells: Iterable[Cell]) -> list[Cell]:
+    """Sort cells by method, the paper's first, then by setting."""
     rank = {method: place for place, method in enumerate(TABLE_METHODS)}
-    return sorted({*paper, *others}, key=lambda cell: (rank.get(cell.method, len(rank)), cell))
+    return sorted(cells, key=lambda cell: (rank.get(cell.method, len(rank)), cell))
 
 
 def _result_row(cell: Cell, runs: _CellRuns | None, paper: PaperResult | None, closure: Closure | None) -> _ResultRow:
@@ -222,6 +240,12 @@ def _result_cells(row: _ResultRow) -> list[str]:
         "not reported" if row.paper is None else _slashed(row.paper),
         "" if row.runs is None else _seeds(row.runs),
     ]
+
+
+def _other_cells(row: _ResultRow) -> list[str]:
+    """Write a row in Markdown with its scene, which the paper's settings have in common."""
+    cells = _result_cells(row)
+    return [*cells[:4], row.cell.setting.scene, *cells[4:]]
 
 
 def _with_interval(estimate: Estimate | Difference, scale: float, sign: str = "") -> str:

@@ -132,6 +132,19 @@ def test_runs_that_the_grid_does_not_ask_for_are_not_in_its_tables(tmp_path: Pat
     assert tables(tmp_path) == before
 
 
+def test_a_setting_that_the_paper_lacks_has_its_table_as_long_as_the_grid_asks_for_it(tmp_path: Path) -> None:
+    (tmp_path / "grid.yaml").write_text(
+        "profile: smoke\ngroups:\n  - methods: [ours]\n"
+        "    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1, scene: tunnel}]\n    seeds: [1]\nshared: []\n"
+    )
+    results = tmp_path / "results"
+    reproduce(str(tmp_path / "grid.yaml"), results, 1)
+    assert "tunnel" in (results / "tables" / "table_other.md").read_text()
+    assert "tunnel" in (results / "tables" / "table_other.csv").read_text()
+    write_tables(load_grid("smoke"), results)
+    assert sorted(tables(results)) == sorted(["table1.md", *TABLES])
+
+
 @pytest.mark.parametrize("status", ["finished", "diverged"])
 def test_a_run_of_another_configuration_is_not_shown(tmp_path: Path, status: str) -> None:
     reproduce("smoke", tmp_path, 1)

@@ -150,8 +150,43 @@ def test_a_method_that_the_paper_lacks_gets_its_rows_after_the_papers() -> None:
     assert [row[0] for row in markdown_rows(rendered["table2.md"])[16:]] == ["Model C", "my_method"]
     assert markdown_row(rendered["table2.md"], "my_method", "1.1", "3", "1")[2] == "not reported"
     assert len(markdown_rows(rendered["table4.md"])) == 16 + 3
-    elsewhere = tables.render_tables([finished("ours", Setting(1.1, 3, 1, "tunnel"), 0, 90)])
-    assert elsewhere == tables.render_tables([])
+
+
+def test_cells_outside_the_papers_settings_have_a_table_of_their_own() -> None:
+    tunnel, five, many = Setting(1.1, 3, 1, "tunnel"), Setting(1.1, 5, 2), Setting(1.25, 3, 0)
+    runs = [
+        finished("my_method", tunnel, 0, 60),
+        finished("ours", tunnel, 900, 80),
+        finished("ours", tunnel, 901, 90),
+        finished("ours", ONE, 0, 90),
+        finished("my_method", ONE, 0, 90),
+        finished("ours", many, 0, 70),
+        Run(Cell("ma2019", five), 3, "diverged", "pursuers"),
+    ]
+    rendered = tables.render_tables(runs, {Cell("model_a", many): Cell("ours", many)})
+    others = rendered.pop("table_other.md"), rendered.pop("table_other.csv")
+    assert rendered == tables.render_tables([run for run in runs if run.cell.setting == ONE]), "they are nowhere else"
+    assert next(line for line in others[0].splitlines() if line.startswith("|")) == (
+        "| Method | λ | n | m | Scene | S % | MEL | Paper S % / MEL | Seeds |"
+    )
+    # mean 85, s = 7.07, t(0.975, 1) = 12.7: wider than 0 to 100
+    assert markdown_rows(others[0]) == [
+        ["Ma", "1.1", "5", "2", "random", "diverged", "diverged", "not reported", "0, 1 diverged (3)"],
+        ["Model A (runs of Ours)", "1.25", "3", "0", "random", "70.00", "20.00", "not reported", "1 (0)"],
+        ["Ours", "1.1", "3", "1", "tunnel", "85.00 [21.47, 100.00]", "20.00 [20.00, 20.00]", "not reported",
+         "2 (900 901)"],
+        ["Ours", "1.25", "3", "0", "random", "70.00", "20.00", "not reported", "1 (0)"],
+        ["my_method", "1.1", "3", "1", "tunnel", "60.00", "20.00", "not reported", "1 (0)"],
+    ]  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO(others[1])))
+    assert list(rows[0]) == list(csv.DictReader(io.StringIO(rendered["table2.csv"])).fieldnames or ())
+    assert [(row["method"], row["scene"], row["closure"], row["result"], row["runs_of"]) for row in rows] == [
+        ("ma2019", "random", "pursuers", "diverged", ""),
+        ("model_a", "random", "all", "run", "ours"),
+        ("ours", "tunnel", "all", "run", ""),
+        ("ours", "random", "all", "run", ""),
+        ("my_method", "tunnel", "all", "run", ""),
+    ]
 
 
 def test_a_cell_of_mixed_rules_or_seeds_twice_is_an_error_that_names_it() -> None:
