@@ -13,6 +13,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import metadata
+from itertools import cycle
 from pathlib import Path
 from statistics import median
 from time import process_time
@@ -73,17 +74,21 @@ AIMS = {
 
 
 def core(n_worlds: int) -> Chunk:
-    """Step the simulator itself: measurement and resets, float64, no reward and no observation."""
+    """Step the simulator itself: measurement and resets, float64, no reward and no observation.
+
+    Every world is reset after ``max_cycles`` steps, a few worlds at each step.
+    """
     simulator = Simulator(SCENARIO, n_worlds, seed=0)
     simulator.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (CHUNK, n_worlds, SCENARIO.pursuers, 2))
+    worlds = np.arange(n_worlds)
+    due = cycle([worlds[worlds % SCENARIO.max_cycles == step] for step in range(SCENARIO.max_cycles)])
 
     def play() -> int:
-        for action in actions:
-            measure = simulator.step(action)
-            finished = measure.enclosure["all"].complete | (simulator.steps >= SCENARIO.max_cycles)
-            if np.count_nonzero(finished):
-                simulator.reset(np.flatnonzero(finished))
+        for action, finished in zip(actions, due, strict=False):
+            simulator.step(action)
+            if len(finished):
+                simulator.reset(finished)
         return CHUNK * n_worlds
 
     return play
