@@ -81,8 +81,10 @@ class Simulator:
         self._everywhere = np.arange(n_worlds)
         self._actions_shape = (n_worlds, scenario.pursuers, 2)
         self._difficulty: Difficulty = {}
-        self.state = s = self._empty_state()
-        self._arrays = (s.pursuers, s.velocities, s.target, s.discs, s.speed_ratio, s.safety_distance, self.steps)
+        # Few arrays with many views: Numba takes as long to unpack three arguments as a world takes to measure.
+        self._motion = np.zeros((2, n_worlds, scenario.pursuers, 2))
+        self._difficulties = np.ones((3, n_worlds))
+        self.state = self._views()
         self._present, self._former = _MeasureBuffers(scenario, n_worlds), _MeasureBuffers(scenario, n_worlds)
         self._streams: list[np.random.Generator] = []
         self.seed(seed)
@@ -147,7 +149,17 @@ class Simulator:
         if array.shape != self._actions_shape:
             raise ValueError(f"actions must have shape {self._actions_shape} (worlds, pursuers, 2); got {array.shape}")
         self._present, self._former = self._former, self._present
-        slot = _advance(array, *self._arrays, self._rays, self._physics, *self._present.arrays)
+        slot = _advance(
+            array,
+            self._motion,
+            self.state.target,
+            self.state.discs,
+            self._difficulties,
+            self.steps,
+            self._rays,
+            self._physics,
+            *self._present.arrays,
+        )
         if slot >= 0:
             self._present, self._former = self._former, self._present
             world, pursuer = divmod(slot, self.scenario.pursuers)
@@ -180,17 +192,19 @@ class Simulator:
             worlds, s.pursuers, s.target, s.discs, s.speed_ratio, self._rays, self._physics, *self._present.arrays
         )
 
-    def _empty_state(self) -> State:
-        b, n, d = self.n_worlds, self.scenario.pursuers, self.scenario.discs
+    def _views(self) -> State:
+        b, d = self.n_worlds, self.scenario.discs
+        pursuers, velocities = self._motion
+        speed_ratio, safety_distance, obstacle_radius = self._difficulties
         return State(
-            pursuers=np.zeros((b, n, 2)),
-            velocities=np.zeros((b, n, 2)),
+            pursuers=pursuers,
+            velocities=velocities,
             target=np.zeros((b, 2)),
             discs=np.zeros((b, d, 3)),
             obstacles=np.zeros((b, self.scenario.obstacles, 2)),
-            speed_ratio=np.ones(b),
-            safety_distance=np.zeros(b),
-            obstacle_radius=np.zeros(b),
+            speed_ratio=speed_ratio,
+            safety_distance=safety_distance,
+            obstacle_radius=obstacle_radius,
         )
 
     def _place(self, worlds: NDArray[np.int64]) -> None:
@@ -238,13 +252,20 @@ class _MeasureBuffers:
         owner = np.full((2, b, k), geometry.NOBODY, np.int8)
         nearness = np.zeros((2, b, k))
         contributing_angle = np.zeros((2, b, n + scenario.units))
-        occupied_angle = np.zeros((2, b))
-        movement_range = np.full((2, b), np.inf)
+        totals = np.stack([np.zeros((2, b)), np.full((2, b), np.inf)])
         complete = np.zeros((2, b), np.bool_)
         target_distance = np.zeros((b, n))
         contacts = np.zeros((3, b, n), np.int64)
-        by_rule = (owner, nearness, contributing_angle, occupied_angle, movement_range, complete)
-        self.arrays: tuple[Any, ...] = (*by_rule, target_distance, contacts)
+        by_rule = (owner, nearness, contributing_angle, *totals, complete)
+        self.arrays: tuple[Any, ...] = (
+            owner,
+            nearness,
+            contributing_angle,
+            totals,
+            complete,
+            target_distance,
+            contacts,
+        )
         self.measure = Measure(
             enclosure={
                 "all": Enclosure(*(a[0] for a in by_rule)),
@@ -260,20 +281,17 @@ class _MeasureBuffers:
 @kernel
 def _advance(
     actions: Array,
-    pursuers: Array,
-    velocities: Array,
+    motion: Array,
     target: Array,
     discs: Array,
-    speed_ratio: Array,
-    safety_distance: Array,
+    difficulties: Array,
     steps: NDArray[np.int64],
     rays: Array,
     constants: Constants,
     owner: NDArray[np.int8],
     nearness: Array,
     contributing_angle: Array,
-    occupied_angle: Array,
-    movement_range: Array,
+    totals: Array,
     complete: NDArray[np.bool_],
     target_distance: Array,
     contacts: NDArray[np.int64],
@@ -283,6 +301,8 @@ def _advance(
         if not np.isfinite(actions.flat[slot]):
             return slot // 2
     physics = constants[0]
+    pursuers, velocities = motion[0], motion[1]
+    speed_ratio, safety_distance = difficulties[0], difficulties[1]
     n_worlds, n = pursuers.shape[:2]
     moved, seen, met = np.empty((n, 2)), np.empty((n, 2)), np.empty(2 * rays.shape[1])
     for b in range(n_worlds):
@@ -302,8 +322,8 @@ def _advance(
             owner,
             nearness,
             contributing_angle,
-            occupied_angle,
-            movement_range,
+            totals[0],
+            totals[1],
             complete,
             target_distance,
             contacts,
@@ -332,8 +352,7 @@ def _enclose_worlds(
     owner: NDArray[np.int8],
     nearness: Array,
     contributing_angle: Array,
-    occupied_angle: Array,
-    movement_range: Array,
+    totals: Array,
     complete: NDArray[np.bool_],
     target_distance: Array,
     contacts: NDArray[np.int64],
@@ -352,8 +371,8 @@ def _enclose_worlds(
             owner,
             nearness,
             contributing_angle,
-            occupied_angle,
-            movement_range,
+            totals[0],
+            totals[1],
             complete,
             target_distance,
             contacts,
