@@ -186,6 +186,14 @@ class Simulator:
             stream.bit_generator.state = stream_state
         self._enclose(self._everywhere)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"scenario": self.scenario, "n_worlds": self.n_worlds, "saved": self.get_state()}
+
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        # Built anew: copied one by one, arrays and the views into them would part.
+        Simulator.__init__(self, pickled["scenario"], pickled["n_worlds"])
+        self.set_state(pickled["saved"])
+
     def _enclose(self, worlds: NDArray[np.int64]) -> None:
         s = self.state
         _enclose_worlds(

@@ -2,6 +2,8 @@
 
 import copy
 import json
+import pickle
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -316,3 +318,23 @@ def test_a_swarm_of_all_sizes_works() -> None:
 
 def test_the_builder_measures_what_it_arranges() -> None:
     assert arranged([(0.3, 0.4)]).measure.target_distance.tolist() == [[0.5]]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda sim: pickle.loads(pickle.dumps(sim))])
+def test_a_copy_plays_on_as_the_original_and_apart_from_it(copied: Callable[[Simulator], Simulator]) -> None:
+    original, rng = Simulator(Scenario(), 3, seed=4), np.random.default_rng(0)
+    original.reset()
+    original.step(random_actions(original, rng))
+    twin = copied(original)
+    for _ in range(5):
+        actions = random_actions(original, rng)
+        theirs, ours = original.step(actions), twin.step(actions)
+        assert np.array_equal(theirs.target_distance, ours.target_distance)
+        for rule in ("all", "pursuers"):
+            for a, b in zip(theirs.enclosure[rule], ours.enclosure[rule], strict=True):
+                assert np.array_equal(a, b)
+    original.reset()
+    twin.reset()
+    assert np.array_equal(original.state.pursuers, twin.state.pursuers)
+    twin.step(actions)
+    assert not np.array_equal(original.state.pursuers, twin.state.pursuers)
