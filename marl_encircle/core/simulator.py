@@ -131,7 +131,7 @@ class Simulator:
         worlds = self._everywhere if worlds is None else worlds
         for name in ("speed_ratio", "safety_distance", "obstacle_radius"):
             values: Array = getattr(self.state, name)
-            values[worlds] = self._difficulty.get(name, getattr(self.scenario, name))  # type: ignore[call-overload]
+            values[worlds] = self._difficulty.get(name, getattr(self.scenario, name))  # type: ignore[call-overload]  # a TypedDict read by a variable name
         self._place(worlds)
         self.state.velocities[worlds] = 0.0
         self.steps[worlds] = 0

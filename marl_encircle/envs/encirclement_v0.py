@@ -79,7 +79,7 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
     :raises ImportError: if something is to be drawn and pygame-ce is missing
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # PettingZoo declares it per instance
         "name": "encirclement_v0",
         "render_modes": ["human", "rgb_array"],
         "is_parallelizable": True,

@@ -152,7 +152,7 @@ class SuperSuitVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Draw each world once, whatever its number of slots; None unless its render mode is ``rgb_array``."""
-        return [world.render() if self.render_mode == "rgb_array" else None for world in self._worlds]  # type: ignore[misc]
+        return [world.render() if self.render_mode == "rgb_array" else None for world in self._worlds]  # type: ignore[misc]  # PettingZoo allows text too
 
     def close(self) -> None:
         """Close all worlds."""
@@ -191,7 +191,7 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         self.index = index
         self.reset_infos: list[dict[str, Any]] = []
         if not hasattr(world.unwrapped, "render_mode"):  # MarkovVectorEnv reads it, PettingZoo does not ask for it
-            world.unwrapped.render_mode = None  # type: ignore[attr-defined]
+            world.unwrapped.render_mode = None  # type: ignore[attr-defined]  # new on that class
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -112,7 +112,7 @@ class _Run:
         if saved is not None:
             _check_same(folder, plan, saved.get("plan", {}))
         self.env = build_vec_env(config, config.training.n_worlds, engine)
-        self.curriculum = cast(CurriculumVecEnv, self.env.venv)  # type: ignore[attr-defined]
+        self.curriculum = cast(CurriculumVecEnv, self.env.venv)  # type: ignore[attr-defined]  # the outermost is a VecMonitor
         self.model = build_model(config, self.env, seed)
         if saved is not None:
             try:
@@ -276,7 +276,7 @@ def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:
 
 def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> None:
     """Compare with what a run or a checkpoint was made with; fields that were added since have their defaults."""
-    other = _plan(config_of(record, folder), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]
+    other = _plan(config_of(record, folder), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]  # only compared, so may be anything
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)

@@ -102,7 +102,7 @@ class JointReplayBuffer(ReplayBuffer):
             self._joint(self.dones, joint) * (1 - self._joint(self.timeouts, joint)),
             self._normalize_reward(self._joint(self.rewards, joint), env),
         )
-        return ReplayBufferSamples(*(self.to_torch(array, copy=False) for array in data))  # type: ignore[arg-type]
+        return ReplayBufferSamples(*(self.to_torch(array, copy=False) for array in data))  # type: ignore[arg-type]  # arrays: no dicts here
 
     def _joint(self, slots: np.ndarray, indices: np.ndarray) -> np.ndarray:
         """Rows of ``slots`` (pos, B * N, ...) regrouped by worlds: a copy of shape (len(indices), N, ...)."""

@@ -170,7 +170,7 @@ class MADDPG(OffPolicyAlgorithm):
                 optimize_memory_usage=self.optimize_memory_usage,
                 **self.replay_buffer_kwargs,
             )
-        self.policy = self.policy_class(  # type: ignore[assignment]
+        self.policy = self.policy_class(  # type: ignore[assignment]  # SB3 types any BasePolicy
             self.observation_space,
             self.action_space,
             self.lr_schedule,
@@ -326,7 +326,7 @@ class MADDPG(OffPolicyAlgorithm):
                 return RolloutReturn(num_collected_steps * n_worlds, num_collected_episodes, continue_training=False)
 
             self._update_info_buffer(infos, dones)
-            self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+            self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]  # SB3 types new_obs with dicts
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._on_step()
 
@@ -351,7 +351,7 @@ class MADDPG(OffPolicyAlgorithm):
         :param n_envs: number of slots
         :return: actions for the environment, and the same scaled to [-1, 1] for the buffer, shapes (B * N, *U)
         """
-        rng, shape = self.exploration_rng, (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        rng, shape = self.exploration_rng, (n_envs, *self.action_space.shape)  # type: ignore[misc]  # a Box has a shape
         if self.num_timesteps < learning_starts:
             scaled = rng.uniform(-1, 1, shape)
         else:
@@ -374,7 +374,7 @@ class MADDPG(OffPolicyAlgorithm):
         self,
         replay_buffer: ReplayBuffer,
         buffer_action: np.ndarray,
-        new_obs: np.ndarray,  # type: ignore[override]
+        new_obs: np.ndarray,  # type: ignore[override]  # SB3 allows dicts, we refuse them
         reward: np.ndarray,
         dones: np.ndarray,
         infos: list[dict[str, Any]],
@@ -391,7 +391,7 @@ class MADDPG(OffPolicyAlgorithm):
         obs, next_obs = self._last_obs, new_obs
         if self._vec_normalize_env is not None:
             obs = self._last_original_obs
-            next_obs = self._last_original_obs = self._vec_normalize_env.get_original_obs()  # type: ignore[assignment]
+            next_obs = self._last_original_obs = self._vec_normalize_env.get_original_obs()  # type: ignore[assignment]  # an array: no dicts here
             reward = self._vec_normalize_env.get_original_reward()
         self._last_obs = new_obs
 

@@ -73,13 +73,13 @@ class StackedMLP(nn.Module):
         m, batch_size, _ = x.shape
         hidden = x.reshape(1, m * batch_size, -1) if self.n == 1 else x.expand(self.n, -1, -1)
         if self._is_relu and layers and th.is_grad_enabled():
-            hidden = ReLULayers.apply(hidden, *chain.from_iterable(layers))  # type: ignore[no-untyped-call]
+            hidden = ReLULayers.apply(hidden, *chain.from_iterable(layers))  # type: ignore[no-untyped-call]  # torch does not type apply
         else:
             for weight, bias in layers:
                 hidden = self.activation(th.baddbmm(bias, hidden, weight))
         if len(head_weight) > 1:
             hidden = hidden.reshape(-1, batch_size, hidden.shape[-1])
-        products: th.Tensor = Heads.apply(hidden, head_weight)  # type: ignore[no-untyped-call]
+        products: th.Tensor = Heads.apply(hidden, head_weight)  # type: ignore[no-untyped-call]  # likewise
         return (products + head_bias).reshape(-1, batch_size, products.shape[-1])
 
 

@@ -266,7 +266,7 @@ class MADDPGPolicy(BasePolicy):
             target.requires_grad_(False)
             network.optimizer = self.optimizer_class(
                 network.parameters(),
-                lr=lr_schedule(1),  # type: ignore[call-arg]
+                lr=lr_schedule(1),  # type: ignore[call-arg]  # not every optimizer's base class has lr
                 **self.optimizer_kwargs,
             )
         # Walking through the modules at every update would take longer than the update of the targets itself
@@ -285,7 +285,7 @@ class MADDPGPolicy(BasePolicy):
         :param tau: share, in [0, 1]
         """
         target_parameters, parameters = self._parameter_lists
-        th._foreach_lerp_(target_parameters, parameters, tau)  # type: ignore[arg-type]
+        th._foreach_lerp_(target_parameters, parameters, tau)  # type: ignore[arg-type]  # parameters are tensors
         for target, network in self._buffer_owners:
             for name, buffer in network.named_buffers(recurse=False):
                 getattr(target, name).copy_(buffer)
@@ -343,7 +343,7 @@ class MADDPGPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self.actor._predict(observation, deterministic=deterministic)
 
-    def predict(  # type: ignore[override]
+    def predict(  # type: ignore[override]  # a dict gives a dict
         self,
         observation: np.ndarray | Mapping[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
