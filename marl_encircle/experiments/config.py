@@ -107,7 +107,7 @@ class Schedule(Section):
 
 
 class AlgorithmConfig(Section):
-    """One of ``ALGORITHMS``. Counts are world steps, one step of all pursuers of one world."""
+    """One of ``ALGORITHMS``. ``*_world_steps`` count steps of all pursuers of one world, ``train_freq`` vec steps."""
 
     name: Annotated[str, AfterValidator(_known_algorithm)]
     critic: Literal["per_agent", "shared"]
@@ -121,8 +121,8 @@ class AlgorithmConfig(Section):
     max_grad_norm: Annotated[float, Field(gt=0)] | None
     buffer_world_steps: Count
     random_world_steps: Annotated[int, Field(ge=0)]
-    vec_steps_per_training: Count
-    updates_per_training: Count
+    train_freq: Count
+    gradient_steps: Count
     exploration_noise: Schedule
     exploration_random: Share
 

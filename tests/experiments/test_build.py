@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch as th
+from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecMonitor
 from tiny_runs import copy_of_finished, finished, tiny
 
@@ -131,6 +132,13 @@ def test_world_steps_become_the_pursuers_steps() -> None:
     assert (model.n_agents, model.gamma, model.tau, model.batch_size, model.seed) == (4, 0.9, 0.01, 1024, 3)
     assert (model.critic_kind, model.policy_delay, model.max_grad_norm) == ("shared", 2, None)
     assert str(model.device) == "cpu"
+
+
+def test_training_frequency_and_gradient_steps_are_sb3s() -> None:
+    config = tiny(overrides=["algorithm.train_freq=2", "algorithm.gradient_steps=3"])
+    model = build_model(config, build_vec_env(config, 4), 0)
+    assert isinstance(model.train_freq, TrainFreq)
+    assert (model.train_freq.frequency, model.gradient_steps) == (2, 3)
 
 
 def test_a_buffer_is_no_larger_than_its_training() -> None:
