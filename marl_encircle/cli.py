@@ -22,9 +22,10 @@ from marl_encircle import files
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.experiments.build import Engine, load_run
 from marl_encircle.experiments.callbacks import Stopped
-from marl_encircle.experiments.config import PACKAGE, Config, Profile, difference, load_config, reward_names
+from marl_encircle.experiments.config import Config, Profile, difference, load_config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import load_grid
+from marl_encircle.experiments.library import PACKAGE, reward_names
 from marl_encircle.experiments.metrics import summarise_run
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.reproduce import reproduce, write_tables

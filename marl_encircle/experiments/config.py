@@ -1,14 +1,12 @@
 """Names, files and overrides -> one checked, complete configuration. Nothing is written before it is.
 
-A configuration has five sections. ``reward`` comes from ``ablations/``, ``baselines/`` or a path; the others from the
-package's ``configs/<section>/``. A file may name a ``base`` that it changes; ``--set section.key=value`` changes last.
+A configuration has five sections, each read from the file that :mod:`marl_encircle.experiments.library` finds;
+``--set section.key=value`` changes last.
 """
 
-import hashlib
-import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from itertools import pairwise
 from pathlib import Path
@@ -30,11 +28,10 @@ from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import Reward, nearest
 from marl_encircle.core.scenario import Scenario
+from marl_encircle.experiments import library
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml, read_yaml
+from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml
 from marl_encircle.maddpg import ALGORITHMS
-
-PACKAGE = Path(__file__).parent.parent
 
 Profile = Literal["full", "smoke"]
 Count = Annotated[int, Field(ge=1, le=10**10)]
@@ -43,8 +40,6 @@ Episodes = Annotated[int, Field(ge=1, le=10**6)]
 
 MAX_POLICY_BYTES = 1 << 26
 """Largest ``policy.safetensors`` that is read back."""
-
-MAX_BASES = 20
 
 METHOD_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 """It names a folder and a row of the tables."""
@@ -195,11 +190,6 @@ class Config(Section):
         return _checked(_build_scenario(scenario), {key: value for key, value in values.items() if key != "scenario"})
 
     @property
-    def hash(self) -> str:
-        """sha256 of the resolved configuration, in hexadecimal."""
-        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
-
-    @property
     def cell(self) -> Cell:
         """Method and setting: which cell of the tables a run belongs to."""
         s = self.scenario
@@ -228,14 +218,14 @@ def load_config(
     """
     reward, algorithm = os.fspath(reward), os.fspath(algorithm)
     changes = _parse_overrides(overrides)
-    fields_of_scenario = merge(_section("scenario", "default"), merge(scenario or {}, changes.get("scenario", {})))
-    world = _build_scenario(fields_of_scenario)
+    changed_fields = merge(scenario or {}, changes.get("scenario", {}))
+    world = _build_scenario(merge(library.load_section("scenario", "default"), changed_fields))
     budget = profile if world.solvable_without_obstacles else f"{profile}_obstacles"
     sections = {
-        "reward": _reward(reward),
-        "algorithm": _section("algorithm", algorithm),
-        "training": _section("training", budget),
-        "evaluation": _section("evaluation", profile),
+        "reward": library.load_reward(reward),
+        "algorithm": library.load_section("algorithm", algorithm),
+        "training": library.load_section("training", budget),
+        "evaluation": library.load_section("evaluation", profile),
     }
     merged = {name: merge(section, changes.get(name, {})) for name, section in sections.items()}
     named = merged["reward"].get("name")
@@ -272,11 +262,6 @@ def check_training(config: Config) -> None:
     _check_memory(config)
 
 
-def reward_names() -> list[str]:
-    """Return the names of the methods that the installation carries."""
-    return sorted(path.stem for folder in _reward_folders() for path in folder.glob("*.yaml"))
-
-
 def difference(
     here: Mapping[str, Any], there: Mapping[str, Any], where: tuple[str, str] = ("here", "there")
 ) -> list[str]:
@@ -290,64 +275,6 @@ def difference(
         for key in dict.fromkeys([*mine, *other])
         if mine.get(key, "missing") != other.get(key, "missing")
     ]
-
-
-def _reward_folders() -> list[Path]:
-    """``ablations`` and ``baselines``: in the package of a built install, beside it in a checkout."""
-    roots = (PACKAGE, PACKAGE.parent)
-    return [root / name for name in ("ablations", "baselines") for root in roots if (root / name).is_dir()]
-
-
-def is_path(name: str) -> bool:
-    """Whether a configuration is given by the path of its file, not by name."""
-    return name.lower().endswith((".yaml", ".yml")) or os.sep in name
-
-
-def _reward(name: str) -> dict[str, Any]:
-    folders = _reward_folders()
-    section = _load(find_file(name, folders, "reward"), folders, "reward")
-    return {"name": Path(name).stem, **section}
-
-
-def _section(section: str, name: str) -> dict[str, Any]:
-    folders = [PACKAGE / "configs" / section]
-    return _load(find_file(name, folders, section), folders, section)
-
-
-def _load(path: Path, folders: Iterable[Path], kind: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Read a file on top of its base's."""
-    real = os.path.realpath(path)
-    if real in seen:
-        raise ConfigError(f"{path}: its base leads back to itself")
-    if len(seen) > MAX_BASES:
-        raise ConfigError(f"{path}: more than {MAX_BASES} bases on top of each other")
-    values = read_yaml(path)
-    base = values.pop("base", None)
-    if base is None:
-        return values
-    if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
-        raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
-    try:
-        below = path.parent / base if is_path(base) else find_file(base, folders, kind)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: base: {error}") from error
-    inherited = _load(below, folders, kind, (*seen, real))
-    if kind == "reward":  # a changed method is another one: without a name of its own, its file's
-        inherited.pop("name", None)
-    return merge(inherited, values)
-
-
-def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
-    """Return the file of that name in one of the folders, or of that path.
-
-    :raises ConfigError: naming the nearest name
-    """
-    if is_path(name):
-        return Path(name)
-    known = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
-    if name not in known:
-        raise ConfigError(f"{kind} {name!r:.80}: no such name, and no path of a .yaml file{nearest(name, known)}")
-    return known[name]
 
 
 def _parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:

@@ -6,16 +6,14 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, ValidationError
 
 from marl_encircle.experiments.config import (
-    PACKAGE,
     Config,
     Profile,
     Section,
     check_seed,
     explain,
-    find_file,
-    is_path,
     load_config,
 )
+from marl_encircle.experiments.library import PACKAGE, find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 

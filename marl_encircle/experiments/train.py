@@ -40,9 +40,10 @@ from marl_encircle.experiments.callbacks import (
     Stopped,
     stop_signals,
 )
-from marl_encircle.experiments.config import PACKAGE, Config, check_seed, check_training, difference
+from marl_encircle.experiments.config import Config, check_seed, check_training, difference
 from marl_encircle.experiments.evaluate import play_rounds
-from marl_encircle.experiments.records import Episode, episodes_to_csv, read_record, run_path
+from marl_encircle.experiments.library import PACKAGE
+from marl_encircle.experiments.records import Episode, config_hash, episodes_to_csv, read_record, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1
@@ -195,7 +196,7 @@ class _Run:
             "status": status,
             "method": self.config.reward.name,
             "config": self.plan["config"],
-            "config_hash": self.config.hash,
+            "config_hash": config_hash(self.plan["config"]),
             "source_hash": source_hash(),
             "seed": self.plan["seed"],
             "engine": self.plan["engine"],

@@ -46,7 +46,7 @@ def record_text(status: str = "finished") -> str:
             "status": status,
             "method": "ours",
             "config": config.to_dict(),
-            "config_hash": config.hash,
+            "config_hash": config_hash(config.to_dict()),
             "engine": "native",
             "sha256": {"policy.safetensors": "0" * 64},
         }

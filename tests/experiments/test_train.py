@@ -38,7 +38,7 @@ from marl_encircle.experiments import callbacks, checkpoint, train
 from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import episodes_from_csv, read_record, read_runs
+from marl_encircle.experiments.records import config_hash, episodes_from_csv, read_record, read_runs
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, maddpg
 
@@ -61,7 +61,7 @@ def test_a_finished_folder_holds_the_record_and_what_it_vouches_for() -> None:
     assert record["schema"] == 1
     assert (record["status"], record["method"], record["seed"], record["engine"]) == ("finished", "ours", 0, "native")
     assert Config.from_dict(record["config"]) == tiny()
-    assert record["config_hash"] == tiny().hash
+    assert record["config_hash"] == config_hash(tiny().to_dict())
     assert record["world_steps"] == 400
     assert record["updates"] == 85  # 100 steps of 4 worlds, but for the 15 with random actions
     assert record["cpu_seconds"] > 0

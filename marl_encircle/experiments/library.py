@@ -1,0 +1,91 @@
+"""Names -> files -> plain values: where methods, sections and grids lie, each file on top of the ``base`` it names.
+
+``reward`` comes from ``ablations/``, ``baselines/`` or a path; the other sections from the package's
+``configs/<section>/`` or a path.
+"""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from marl_encircle.core.rewards import nearest
+from marl_encircle.experiments.yaml_files import ConfigError, merge, read_yaml
+
+PACKAGE = Path(__file__).parent.parent
+
+MAX_BASES = 20
+
+
+def reward_names() -> list[str]:
+    """Return the names of the methods that the installation carries."""
+    return sorted(path.stem for folder in _reward_folders() for path in folder.glob("*.yaml"))
+
+
+def load_reward(name: str) -> dict[str, Any]:
+    """Return the values of a method's file, named after the file unless it says otherwise.
+
+    :param name: a name in ``ablations/`` or ``baselines/``, or the path of a YAML file
+    :raises ConfigError: naming the file, and the nearest name
+    """
+    folders = _reward_folders()
+    section = _load(find_file(name, folders, "reward"), folders, "reward")
+    return {"name": Path(name).stem, **section}
+
+
+def load_section(section: str, name: str) -> dict[str, Any]:
+    """Return the values of a section's file.
+
+    :param section: a folder of ``configs/``
+    :param name: a name in that folder, or the path of a YAML file
+    :raises ConfigError: naming the file, and the nearest name
+    """
+    folders = [PACKAGE / "configs" / section]
+    return _load(find_file(name, folders, section), folders, section)
+
+
+def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
+    """Return the file of that name in one of the folders, or of that path.
+
+    :raises ConfigError: naming the nearest name
+    """
+    if is_path(name):
+        return Path(name)
+    known = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
+    if name not in known:
+        raise ConfigError(f"{kind} {name!r:.80}: no such name, and no path of a .yaml file{nearest(name, known)}")
+    return known[name]
+
+
+def is_path(name: str) -> bool:
+    """Whether a configuration is given by the path of its file, not by name."""
+    return name.lower().endswith((".yaml", ".yml")) or os.sep in name
+
+
+def _reward_folders() -> list[Path]:
+    """``ablations`` and ``baselines``: in the package of a built install, beside it in a checkout."""
+    roots = (PACKAGE, PACKAGE.parent)
+    return [root / name for name in ("ablations", "baselines") for root in roots if (root / name).is_dir()]
+
+
+def _load(path: Path, folders: Iterable[Path], kind: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read a file on top of its base's."""
+    real = os.path.realpath(path)
+    if real in seen:
+        raise ConfigError(f"{path}: its base leads back to itself")
+    if len(seen) > MAX_BASES:
+        raise ConfigError(f"{path}: more than {MAX_BASES} bases on top of each other")
+    values = read_yaml(path)
+    base = values.pop("base", None)
+    if base is None:
+        return values
+    if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
+        raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
+    try:
+        below = path.parent / base if is_path(base) else find_file(base, folders, kind)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: base: {error}") from error
+    inherited = _load(below, folders, kind, (*seen, real))
+    if kind == "reward":  # a changed method is another one: without a name of its own, its file's
+        inherited.pop("name", None)
+    return merge(inherited, values)
