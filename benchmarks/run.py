@@ -31,7 +31,7 @@ from marl_encircle.core.simulator import Simulator
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.build import make_vec_env
-from marl_encircle.experiments.train import cpu_model, git_commit, versions
+from marl_encircle.experiments.provenance import cpu_model, git_commit, versions
 from marl_encircle.maddpg import MADDPG
 from marl_encircle.maddpg.policies import CriticKind
 

@@ -32,7 +32,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from marl_encircle import files
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.experiments.metrics import student_interval
-from marl_encircle.experiments.train import cpu_model, git_commit, versions
+from marl_encircle.experiments.provenance import cpu_model, git_commit, versions
 from marl_encircle.maddpg import MADDPG
 
 try:

@@ -5,12 +5,7 @@ actors), ``progress.csv`` (the learning curve) and ``episodes.csv`` (the evaluat
 machine and versions give equal files, save the times and versions in ``run.json``.
 """
 
-import hashlib
-import os
-import platform
-import subprocess
 import time
-from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
 
@@ -42,13 +37,12 @@ from marl_encircle.experiments.callbacks import (
 )
 from marl_encircle.experiments.config import Config, check_seed, check_training, difference
 from marl_encircle.experiments.evaluate import play_rounds
-from marl_encircle.experiments.library import PACKAGE
+from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import Episode, config_hash, episodes_to_csv, read_record, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1
 ROUNDS_PER_LOG = 500
-PACKAGES = ("numpy", "numba", "torch", "stable-baselines3", "gymnasium", "pettingzoo", "supersuit")
 
 
 class OtherRunError(ConfigError):
@@ -220,41 +214,6 @@ def write_episodes(folder: Path, episodes: list[Episode]) -> None:
     record["sha256"] = dict(sorted({**record["sha256"], "episodes.csv": files.sha256_bytes(data)}.items()))
     files.write_bytes(folder / "episodes.csv", data)
     files.write_json(folder / "run.json", record)
-
-
-def source_hash() -> str:
-    """sha256 over the package's Python and YAML files, in hexadecimal."""
-    digest = hashlib.sha256()
-    for path in sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.yaml")]):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
-
-
-def git_commit() -> str | None:
-    """Return the commit of the checkout that the package runs from, ``-dirty`` if it has changes; else None."""
-    if not (PACKAGE.parent / ".git").exists():  # else that of a repository around an installation
-        return None
-    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
-
-
-def versions() -> dict[str, str]:
-    """Return the versions that results depend on."""
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in PACKAGES}}
-
-
-def cpu_model() -> str:
-    """Return the processor's name."""
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or os.uname().machine
 
 
 def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:

@@ -88,31 +88,6 @@ def test_the_tables_read_what_the_training_wrote() -> None:
     assert (run.cell, run.seed, run.status, run.closure) == (tiny().cell, 0, "finished", "all")
 
 
-def test_the_source_hash_covers_code_and_configs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    before = train.source_hash()
-    for name in ("a.py", "b/c.yaml"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("1\n")
-    monkeypatch.setattr(train, "PACKAGE", tmp_path)
-    here = train.source_hash()
-    assert here != before
-    for name in ("a.py", "b/c.yaml"):
-        (tmp_path / name).write_text("2\n")
-        assert train.source_hash() != here
-        (tmp_path / name).write_text("1\n")
-    assert train.source_hash() == here
-
-
-def test_an_installation_does_not_take_a_strangers_commit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@example.org"]
-    for arguments in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "theirs"]):
-        subprocess.run([*git, *arguments], check=True)
-    inside = tmp_path / "venv" / "site-packages" / "marl_encircle"
-    inside.mkdir(parents=True)
-    monkeypatch.setattr(train, "PACKAGE", inside)
-    assert train.git_commit() is None
-
-
 # again, and another one
 
 
