@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from marl_encircle import files
+from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.experiments.build import Engine, load_run
 from marl_encircle.experiments.callbacks import Stopped
@@ -346,7 +346,7 @@ def main() -> None:
     """Run the command; errors become one message and an exit code."""
     try:
         app()
-    except (ConfigError, PlacementError, files.FolderLockedError) as error:
+    except (ConfigError, PlacementError, locks.FolderLockedError) as error:
         _fail(error, 2)
     except files.DamagedFileError as error:
         _fail(error, 3)

@@ -1,4 +1,4 @@
-"""Whole files, written atomically: the only module of the package that writes any.
+"""Whole files, written atomically: the only module of the package that writes any, save the lock files of ``locks``.
 
 A file is never appended to and never changed in place. The new content goes to a temporary file in the same folder, is
 flushed to the disk, takes the name of the old file in one step, and the folder is flushed. Whatever kills the process
@@ -9,7 +9,6 @@ A temporary file which a killed process left behind is removed by the next save 
 """
 
 import errno
-import fcntl
 import hashlib
 import itertools
 import json
@@ -21,11 +20,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-LOCK_NAME = ".lock"
 TEMPORARY_PREFIX = ".tmp"
 
 _counter = itertools.count()
-_held_locks: set[int] = set()
 
 
 class DamagedFileError(ValueError):
@@ -39,22 +36,6 @@ class DamagedFileError(ValueError):
         super().__init__(f"{path}: {reason}")
         self.path = Path(path)
         self.reason = reason
-
-
-class FolderLockedError(RuntimeError):
-    """Another process works in the folder.
-
-    :param folder: the folder
-    :param pid: process which holds the lock; None in the instant before it has written it down
-    :param host: the machine that process runs on
-    """
-
-    def __init__(self, folder: str | Path, pid: int | None, host: str | None) -> None:
-        holder = "another process" if pid is None else f"process {pid} on host {host}"
-        super().__init__(f"{folder}: {holder} works in this folder; wait for it to end or choose another folder")
-        self.folder = Path(folder)
-        self.pid = pid
-        self.host = host
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -234,75 +215,3 @@ def sha256_file(path: str | Path) -> str:
     """SHA-256 of a file, in hexadecimal, read in pieces."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def folder_lock(folder: str | Path) -> Iterator[None]:
-    """Keep a folder to this process while the block runs.
-
-    The lock is the kernel's, on the file ``.lock``: it falls when the process dies in whatever way, so a dead one's is
-    taken over without guessing from process numbers. The file only says who holds it. Forked children do not hold it.
-
-    :param folder: the folder; made if missing
-    :raises FolderLockedError: another process (or another block of this one) holds it, with its pid and host
-    :raises OSError: with the name of the lock file
-    """
-    path = Path(folder) / LOCK_NAME
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = _acquire(path)
-    except OSError as error:
-        raise OSError(error.errno, f"the folder cannot be locked: {error.strerror or error}", str(path)) from error
-    try:
-        yield
-    finally:
-        if descriptor in _held_locks:  # not so in a forked child that leaves the block
-            with suppress(OSError):  # a folder that has vanished takes its lock along
-                path.unlink(missing_ok=True)
-            _held_locks.discard(descriptor)
-            os.close(descriptor)
-
-
-def _acquire(path: Path) -> int:
-    """Lock the file of that name and write down who holds it; returns the open descriptor."""
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _still_named(descriptor, path):  # else its former holder removed it between our open and our lock
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
-                _held_locks.add(descriptor)
-                return descriptor
-        except BlockingIOError:
-            raise FolderLockedError(path.parent, *_parse_holder(os.pread(descriptor, 1024, 0))) from None
-        finally:
-            if descriptor not in _held_locks:
-                os.close(descriptor)
-
-
-def _still_named(descriptor: int, path: Path) -> bool:
-    """Whether the open file is the one that has the name."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _parse_holder(data: bytes) -> tuple[int | None, str | None]:
-    """Pid and host from a lock file; None for both while its holder has not written them yet."""
-    try:
-        holder = json.loads(data)
-        return int(holder["pid"]), str(holder["host"])[:80]
-    except (ValueError, TypeError, KeyError):
-        return None, None
-
-
-def _let_go_in_child() -> None:
-    """Close inherited locks after a fork; the parent keeps them, and its death alone frees them."""
-    for descriptor in _held_locks:
-        os.close(descriptor)
-    _held_locks.clear()
-
-
-os.register_at_fork(after_in_child=_let_go_in_child)

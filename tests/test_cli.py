@@ -24,7 +24,7 @@ from tiny_runs import (
     tiny_arguments,
 )
 
-from marl_encircle import cli, files
+from marl_encircle import cli, files, locks
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments import train
@@ -135,7 +135,7 @@ def test_a_bad_configuration_ends_with_2_and_leaves_nothing(run: Run, tmp_path: 
 
 
 def test_a_locked_folder_ends_with_2_naming_pid_and_host(run: Run, runs: Path) -> None:
-    with files.folder_lock(train.run_folder(load_config(profile="smoke"), 0, runs)):
+    with locks.folder_lock(train.run_folder(load_config(profile="smoke"), 0, runs)):
         done = run("train", "--profile", "smoke", "--out", runs)
     assert done.code == 2
     assert f"process {os.getpid()} on host {socket.gethostname()}" in done.err
@@ -356,7 +356,7 @@ def test_sweep_counts_and_names_what_failed(run: Run, runs: Path, tmp_path: Path
 
 @pytest.mark.usefixtures("_tiny_workers")
 def test_a_second_sweep_ends_with_2_naming_pid_and_host(run: Run, runs: Path, tmp_path: Path) -> None:
-    with files.folder_lock(runs):
+    with locks.folder_lock(runs):
         done = run("sweep", grid(tmp_path, [0]), "--out", runs)
     assert done.code == 2
     assert f"process {os.getpid()} on host {socket.gethostname()}" in done.err

@@ -1,15 +1,12 @@
 import errno
-import fcntl
 import json
 import os
 import random
 import resource
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -280,106 +277,6 @@ def test_reading_refuses_what_is_missing_large_or_changed(tmp_path: Path) -> Non
     assert str(path) in str(caught.value)
 
 
-HOLD_LOCK = """
-import time
-with files["folder_lock"](sys.argv[2]):
-    print("held", flush=True)
-    time.sleep(60)
-"""
-
-
-@pytest.fixture
-def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen(run_module(HOLD_LOCK, tmp_path), stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "held\n"
-        yield process
-        process.kill()
-
-
-def test_the_second_one_is_refused_by_pid_and_host(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
-    with pytest.raises(files.FolderLockedError) as caught, files.folder_lock(tmp_path):
-        pass
-    assert (caught.value.pid, caught.value.host) == (holder.pid, socket.gethostname())
-    assert f"process {holder.pid} on host {socket.gethostname()}" in str(caught.value)
-    assert str(tmp_path) in str(caught.value)
-
-
-def test_a_dead_ones_lock_is_taken_over(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
-    holder.kill()
-    holder.wait()
-    assert json.loads((tmp_path / ".lock").read_text())["pid"] == holder.pid
-    with files.folder_lock(tmp_path):
-        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
-    assert names(tmp_path) == []
-
-
-def test_one_process_cannot_hold_a_folder_twice_and_can_take_it_again(tmp_path: Path) -> None:
-    with files.folder_lock(tmp_path):
-        with pytest.raises(files.FolderLockedError, match=str(os.getpid())), files.folder_lock(tmp_path):
-            pass
-        with pytest.raises(files.FolderLockedError), files.folder_lock(tmp_path):
-            pass
-    with files.folder_lock(tmp_path / "below"), files.folder_lock(tmp_path):
-        pass
-
-
-HOLD_LOCK_AND_FORK = """
-import os, time
-with files["folder_lock"](sys.argv[2]):
-    child = os.fork()
-    if child:
-        print(child, flush=True)
-    time.sleep(60)
-"""
-
-
-def test_a_dead_ones_lock_is_taken_over_while_its_forked_child_lives(tmp_path: Path) -> None:
-    with subprocess.Popen(run_module(HOLD_LOCK_AND_FORK, tmp_path), stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        child = int(process.stdout.readline())
-        try:
-            with pytest.raises(files.FolderLockedError, match=str(process.pid)), files.folder_lock(tmp_path):
-                pass
-            process.kill()
-            process.wait()
-            os.kill(child, 0)
-            with files.folder_lock(tmp_path):
-                pass
-        finally:
-            os.kill(child, signal.SIGKILL)
-
-
-def test_a_lock_whose_holder_removed_it_just_now_is_not_taken_for_the_new_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real, calls = fcntl.flock, iter(range(1_000))
-
-    def flock(descriptor: int, operation: int) -> None:
-        if next(calls) == 0:
-            (tmp_path / ".lock").unlink()
-        real(descriptor, operation)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError), files.folder_lock(tmp_path):
-        pass
-
-
-def test_a_lock_that_says_nothing_readable_still_locks(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
-    (tmp_path / ".lock").write_bytes(b"\xff[")
-    with (
-        pytest.raises(files.FolderLockedError, match="another process works in this folder"),
-        files.folder_lock(tmp_path),
-    ):
-        pass
-
-
-def test_a_folder_that_cannot_be_locked_is_an_error_that_names_the_lock(tmp_path: Path) -> None:
-    (tmp_path / ".lock").mkdir()
-    with pytest.raises(OSError, match=r"cannot be locked.*/\.lock"), files.folder_lock(tmp_path):
-        pass
-
-
 def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
     def count() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))
@@ -387,8 +284,6 @@ def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
     before = count()
     for _ in range(20):
         files.write_bytes(tmp_path / "f", NEW)
-        with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError), files.folder_lock(tmp_path):
-            pass
         with pytest.raises(ZeroDivisionError), files.atomic_path(tmp_path / "f"):
             _ = 1 / 0
     assert count() == before

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from marl_encircle import files
+from marl_encircle import locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.grid import Job, arguments
 from marl_encircle.experiments.records import read_record
@@ -54,7 +54,7 @@ def sweep(
     :raises OtherRunError: if a finished run there has another configuration
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
     """
-    with files.folder_lock(out), stop_signals() as caught:
+    with locks.folder_lock(out), stop_signals() as caught:
         progress = Progress(total=len(jobs))
         waiting = []
         for job in jobs:

@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, configure
 
-from marl_encircle import files
+from marl_encircle import files, locks
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint
@@ -86,7 +86,7 @@ def train(
     plan = _plan(config, seed, engine)
     check_training(config)
     _check_placement(config)
-    with files.folder_lock(folder):
+    with locks.folder_lock(folder):
         if (folder / "run.json").exists():  # by whoever had the lock until now
             check_same_run(folder, config, seed, engine)
             return folder, False

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from tiny_runs import TINY, in_another_process
 
-from marl_encircle import files
+from marl_encircle import locks
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import Setting, config_hash
@@ -129,7 +129,7 @@ def test_a_run_of_the_other_engine_is_as_good(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_second_sweep_on_the_folder_is_refused_by_pid(tmp_path: Path) -> None:
-    with files.folder_lock(tmp_path), pytest.raises(files.FolderLockedError, match=f"process {os.getpid()} on host"):
+    with locks.folder_lock(tmp_path), pytest.raises(locks.FolderLockedError, match=f"process {os.getpid()} on host"):
         sweep(JOBS, tmp_path, 1)
 
 
@@ -184,7 +184,7 @@ def test_a_sweep_that_ends_leaves_no_worker_behind(tmp_path: Path, number: int) 
     else:
         assert process.exitcode == 1, "an uncaught Stopped ends a process with 1"
         assert (tmp_path / "stopped").exists(), "the worker was not asked, so it wrote no checkpoint"
-    with files.folder_lock(tmp_path):
+    with locks.folder_lock(tmp_path):
         pass
 
 

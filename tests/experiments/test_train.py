@@ -31,7 +31,7 @@ from tiny_runs import (
 )
 from torch.nn import functional
 
-from marl_encircle import files
+from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import callbacks, checkpoint, train
@@ -128,7 +128,7 @@ def test_an_unfinished_run_of_another_configuration_is_left_alone(
 
 
 def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
-    with files.folder_lock(train.run_folder(tiny(), 0, tmp_path)), pytest.raises(files.FolderLockedError):
+    with locks.folder_lock(train.run_folder(tiny(), 0, tmp_path)), pytest.raises(locks.FolderLockedError):
         train.train(tiny(), 0, "native", tmp_path)
 
 
