@@ -21,6 +21,7 @@ from rich.table import Table
 from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.experiments.build import Engine, load_run
+from marl_encircle.experiments.calibrate import CalibrationError, calibrate, load_protocol
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config, Profile, difference, load_config
 from marl_encircle.experiments.evaluate import play_rounds
@@ -47,6 +48,7 @@ SpeedRatio = Annotated[float, typer.Option(help="Target speed / pursuer speed.")
 Pursuers = Annotated[int, typer.Option(help="Number of pursuers.")]
 Obstacles = Annotated[int, typer.Option(help="Number of obstacles.")]
 Scene = Annotated[str, typer.Option(help="What an obstacle looks like: random, concave or tunnel.")]
+Scenario = Annotated[str, typer.Option(help="The world's rules: default, paper, or the path of a YAML file.")]
 Algorithm = Annotated[str, typer.Option(help="maddpg, matd3, or the path of a YAML file.")]
 ProfileOption = Annotated[Profile, typer.Option(help="full, or smoke for a few seconds.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override: section.key=value. May be repeated.")]
@@ -83,6 +85,7 @@ def train_command(
     obstacles: Obstacles = 1,
     scene: Scene = "random",
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Training seed.")] = 0,
+    scenario: Scenario = "default",
     algorithm: Algorithm = "maddpg",
     engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
     profile: ProfileOption = "full",
@@ -92,11 +95,11 @@ def train_command(
     tensorboard: Annotated[bool, typer.Option(help="Write event files into the run folder.")] = True,
     quiet: Quiet = False,
 ) -> None:
-    """Train one run, evaluate it, and print its folder; an interrupted one goes on where it stopped.
+    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped.
 
     Example: marl-encircle train --reward ablations/my_idea.yaml --pursuers 4 --set training.world_steps=200000
     """
-    config = _config(reward, speed_ratio, pursuers, obstacles, scene, algorithm, profile, overrides)
+    config = _config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
     folder, worked = train(
         config,
         seed,
@@ -110,7 +113,7 @@ def train_command(
     if not worked:
         typer.echo("already finished", err=True)
     if diverged:
-        typer.echo("diverged: kept and counted as such; another seed or configuration may not", err=True)
+        typer.echo("diverged: the run is kept and counted as diverged; try another seed or configuration", err=True)
     typer.echo(str(folder))
     if diverged:
         raise typer.Exit(1)
@@ -127,7 +130,7 @@ def evaluate(
     ] = None,
     as_json: AsJson = False,
     write: Annotated[
-        bool, typer.Option("--write", help="Replace the episodes.csv of a finished run; only with the defaults.")
+        bool, typer.Option("--write", help="Replace the episodes.csv of a finished run; only with the default rounds.")
     ] = False,
 ) -> None:
     """Play rounds with a trained policy, noise off, and print how they ended."""
@@ -136,14 +139,16 @@ def evaluate(
     episodes = own_rounds[0] if episodes is None else episodes
     seed = own_rounds[1] if seed is None else seed
     if seed == record["seed"]:
-        raise ConfigError(f"--seed {seed} is the run's training seed: it was trained in these worlds; give another one")
+        raise ConfigError(
+            f"--seed {seed} is the run's training seed: the policy was trained in these worlds; choose another seed"
+        )
     if write and record["status"] != "finished":
-        raise ConfigError(f"--write is for finished runs; {run_dir}: its status is {record['status']}")
+        raise ConfigError(f"--write needs a finished run; the status of {run_dir} is {record['status']}")
     if write and (episodes, seed) != own_rounds:
         flags = f"--episodes {own_rounds[0]} --seed {own_rounds[1]}"
-        raise ConfigError(f"--write keeps the rounds that the run's configuration asks for: {flags}")
+        raise ConfigError(f"--write needs the rounds of the run's configuration: {flags}")
     if record["status"] == "diverged":
-        typer.echo("warning: this run diverged; its policy is the one that its training ended with", err=True)
+        typer.echo("warning: this run diverged; its policy is the last one of its training", err=True)
     rounds = play_rounds(policy, config, episodes, seed)
     closure = config.reward.closure
     own = summarise_run(rounds, closure)
@@ -182,7 +187,7 @@ def sweep_command(
     out: Out = Path("results/runs"),
     as_json: AsJson = False,
 ) -> None:
-    """Train every run of a grid that is missing."""
+    """Train the missing runs of a grid."""
     with _live() as report:
         progress = sweep(load_grid(grid).jobs, out, jobs, report)
     counts = {
@@ -199,12 +204,30 @@ def sweep_command(
     _exit_if_failed(progress)
 
 
+@app.command("calibrate")
+def calibrate_command(
+    protocol: Annotated[str, typer.Argument(help="calibration, or the path of a YAML file.")] = "calibration",
+    jobs: Jobs = 1,
+    out: Annotated[Path, typer.Option(help="Folder of the calibration.")] = Path("results/calibration"),
+) -> None:
+    """Train the scenarios of a protocol and choose the one that comes nearest to the paper's cells.
+
+    What is missing is trained, so that it can be stopped and started again. OUT gets the runs, the sensitivity table
+    and the chosen scenario.
+    """
+    plan = load_protocol(protocol)
+    with _live() as report:
+        calibrate(plan, out, jobs, report)
+    typer.echo((out / "sensitivity.md").read_text(encoding="utf-8"))
+    typer.echo(str(out / "scenario.yaml"))
+
+
 @app.command()
 def tables(
     grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
     out: Results = Path("results"),
 ) -> None:
-    """Render the tables from the runs there are."""
+    """Render the tables from the existing runs."""
     for path in write_tables(load_grid(grid), out):
         typer.echo(str(path))
 
@@ -240,13 +263,14 @@ def config_show(
     pursuers: Pursuers = 3,
     obstacles: Obstacles = 1,
     scene: Scene = "random",
+    scenario: Scenario = "default",
     algorithm: Algorithm = "maddpg",
     profile: ProfileOption = "full",
     overrides: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Print a resolved configuration; the reward as a table of terms and weights."""
-    config = _config(reward, speed_ratio, pursuers, obstacles, scene, algorithm, profile, overrides)
+    config = _config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
     values = config.to_dict()
     if as_json:
         typer.echo(json.dumps(values, indent=2))
@@ -273,7 +297,7 @@ def config_diff(first: str, second: str, profile: ProfileOption = "full") -> Non
 
 @config_app.command("validate")
 def config_validate(path: Annotated[str, typer.Argument(help="A method's name or the path of a YAML file.")]) -> None:
-    """Check a method's file; say nothing but 'valid', or what is wrong with it (exit code 2)."""
+    """Check a method's file: print 'valid', or what is wrong with it (exit code 2)."""
     load_config(path)
     typer.echo("valid")
 
@@ -284,12 +308,15 @@ def _config(
     pursuers: int,
     obstacles: int,
     scene: str,
+    scenario: str,
     algorithm: str,
     profile: Profile,
     overrides: list[str] | None,
 ) -> Config:
-    scenario = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
-    return load_config(reward, algorithm=algorithm, profile=profile, scenario=scenario, overrides=overrides or ())
+    fields = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
+    return load_config(
+        reward, algorithm=algorithm, profile=profile, scenario=scenario, fields=fields, overrides=overrides or ()
+    )
 
 
 def _reward_table(config: Config) -> Table:
@@ -352,7 +379,7 @@ def main() -> None:
         _fail(error, 3)
     except Stopped as stopped:
         _fail(stopped, 128 + stopped.signum)
-    except OSError as error:
+    except (CalibrationError, OSError) as error:
         _fail(error, 1)
 
 

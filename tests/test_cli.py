@@ -67,7 +67,7 @@ def test_train_refuses_a_folder_of_another_configuration_with_the_difference(run
     before = everything_in(runs)
     done = run("train", *tiny_arguments("--out", str(runs), "--set", "algorithm.gamma=0.8"))
     assert (done.code, done.out) == (2, "")
-    assert f"{folder} holds another run" in done.err
+    assert f"{folder} already holds a different run" in done.err
     assert "config.algorithm.gamma: 0.8 here, 0.9 there" in done.err
     assert everything_in(runs) == before
 
@@ -155,7 +155,7 @@ def test_a_damaged_checkpoint_ends_with_3(run: Run, runs: Path) -> None:
     (folder / "checkpoint.safetensors").write_bytes(b"x")
     done = run("train", *tiny_arguments("--out", str(runs)))
     assert done.code == 3
-    assert "checkpoint.safetensors: is no checkpoint" in done.err
+    assert "checkpoint.safetensors: not a valid checkpoint" in done.err
 
 
 def train_and_stop(out: Path, number: int) -> None:
@@ -250,7 +250,7 @@ def test_other_rounds_than_the_runs_own_are_not_written(run: Run, runs: Path, ar
     before = contents(folder), (folder / "run.json").read_bytes()
     done = run("evaluate", folder, *arguments, "--write")
     assert (done.code, done.out) == (2, "")
-    assert "--write keeps the rounds that the run's configuration asks for: --episodes 8 --seed 1000" in done.err
+    assert "--write needs the rounds of the run's configuration: --episodes 8 --seed 1000" in done.err
     assert (contents(folder), (folder / "run.json").read_bytes()) == before
 
 
@@ -281,7 +281,7 @@ def test_a_diverged_run_is_evaluated_with_a_warning_and_not_written(run: Run, ru
     [
         ("policy.safetensors", b"x", "policy.safetensors: changed since it was written"),
         ("policy.safetensors", None, "policy.safetensors: the file is missing"),
-        ("run.json", b"{", "run.json: is not valid JSON"),
+        ("run.json", b"{", "run.json: not valid JSON"),
         ("run.json", b"{}", "run.json"),
         ("run.json", None, "run.json: the file is missing"),
     ],
@@ -417,7 +417,7 @@ def test_config_show_prints_terms_and_weights_and_every_section(run: Run) -> Non
 
 def test_config_show_as_json_is_the_resolved_configuration(run: Run) -> None:
     done = run("config", "show", "--profile", "smoke", "--obstacles", "2", "--set", "training.n_worlds=3", "--json")
-    expected = load_config(profile="smoke", scenario={"obstacles": 2}, overrides=["training.n_worlds=3"])
+    expected = load_config(profile="smoke", fields={"obstacles": 2}, overrides=["training.n_worlds=3"])
     assert json.loads(done.out) == expected.to_dict()
 
 
@@ -483,4 +483,4 @@ def test_the_module_is_the_command(tmp_path: Path, module: str) -> None:
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: reward 'our': no such name, and no path of a .yaml file; did you mean ours?\n"
+    assert done.stderr == "error: reward 'our': neither a known name nor the path of a .yaml file; did you mean ours?\n"

@@ -41,7 +41,7 @@ FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
 
 def tiny(reward: str = "ours", overrides: Sequence[str] = (), **scenario: Any) -> Config:
     """A configuration whose training takes half a second."""
-    return load_config(reward, profile="smoke", scenario=scenario, overrides=[*TINY, *overrides])
+    return load_config(reward, profile="smoke", fields=scenario, overrides=[*TINY, *overrides])
 
 
 def tiny_arguments(*more: str) -> list[str]:

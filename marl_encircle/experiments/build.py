@@ -36,17 +36,19 @@ def make_vec_env(
     reward: str | Path = "ours",
     n_worlds: int = 64,
     *,
+    scenario: str | Path = "default",
     engine: Engine = "native",
     seed: int | None = None,
     curriculum: bool = True,
     profile: Profile = "full",
     overrides: Sequence[str] = (),
-    **scenario: Any,
+    **fields: Any,
 ) -> VecEnv:
     """Return worlds to train in: ``n_worlds * pursuers`` slots, monitored, with the setting's curriculum.
 
     :param reward: a method's name or the path of its YAML file
     :param n_worlds: worlds side by side
+    :param scenario: a name in ``configs/scenario/``, or the path of a YAML file
     :param engine: ``native``, fast, or ``supersuit``, the PettingZoo environment through SuperSuit; equal seeds give
         equal trajectories
     :param seed: of the worlds; without one they start from fresh entropy. Those of ``evaluation.seed`` are the rounds
@@ -55,10 +57,10 @@ def make_vec_env(
         worlds are final from the start, for evaluation
     :param profile: see :func:`marl_encircle.experiments.config.load_config`
     :param overrides: ``section.key=value`` each
-    :param scenario: fields of ``Scenario``, for example ``pursuers=3, obstacles=1, speed_ratio=1.1``
+    :param fields: fields of ``Scenario`` that differ from it, for example ``pursuers=3, obstacles=1, speed_ratio=1.1``
     :raises ConfigError: for an unknown name or a value that is not allowed
     """
-    config = load_config(reward, profile=profile, scenario=scenario, overrides=overrides)
+    config = load_config(reward, profile=profile, scenario=scenario, fields=fields, overrides=overrides)
     _check_integer("n_worlds", n_worlds, least=1)
     if seed is not None:
         _check_integer("seed", seed, least=0)
@@ -91,7 +93,7 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
 def check_engine(engine: str) -> None:
     """Raise a ConfigError, naming the nearest, unless there is such an engine."""
     if engine not in get_args(Engine):
-        raise ConfigError(f"engine {engine!r:.80}: no such engine{nearest(str(engine), get_args(Engine))}")
+        raise ConfigError(f"engine {engine!r:.80}: unknown engine{nearest(str(engine), get_args(Engine))}")
 
 
 def _check_integer(name: str, value: object, least: int) -> None:
@@ -192,12 +194,12 @@ def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, An
         tensors = safetensors.torch.load(data)
         for name, weights in policy.actor_state_dict().items():
             if name in tensors and tensors[name].dtype != weights.dtype:
-                raise ValueError(f"{name} has the type {tensors[name].dtype}")
+                raise ValueError(f"{name} has dtype {tensors[name].dtype}")
         policy.actor.load_state_dict(tensors)
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
         raise files.DamagedFileError(path, f"does not hold this policy's weights: {str(error)[:200]}") from error
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise files.DamagedFileError(path, "has weights that are not finite")
+        raise files.DamagedFileError(path, "contains weights that are not finite")
     policy.set_training_mode(False)
     return policy, config, record
 

@@ -53,7 +53,7 @@ def _even(value: int) -> int:
 
 def _known_algorithm(name: str) -> str:
     if name not in ALGORITHMS:
-        raise ValueError(f"no such algorithm{nearest(name, ALGORITHMS)}")
+        raise ValueError(f"unknown algorithm{nearest(name, ALGORITHMS)}")
     return name
 
 
@@ -69,7 +69,7 @@ def _as_floats(value: Any) -> Any:
         try:
             return float(value)
         except OverflowError as error:
-            raise ValueError("a number is too large") from error
+            raise ValueError("number too large for a float") from error
     return value
 
 
@@ -201,7 +201,8 @@ def load_config(
     *,
     algorithm: str | Path = "maddpg",
     profile: Profile = "full",
-    scenario: Mapping[str, Any] | None = None,
+    scenario: str | Path = "default",
+    fields: Mapping[str, Any] | None = None,
     overrides: Sequence[str] = (),
 ) -> Config:
     """Return the checked configuration of a run.
@@ -212,14 +213,15 @@ def load_config(
     :param reward: a name in ``ablations/`` or ``baselines/``, or the path of a YAML file
     :param algorithm: a name in ``configs/algorithm/``, or a path
     :param profile: ``full``, or ``smoke`` for a few seconds
-    :param scenario: fields of ``Scenario`` that differ from ``configs/scenario/default.yaml``
+    :param scenario: a name in ``configs/scenario/``, or a path
+    :param fields: fields of ``Scenario`` that differ from it
     :param overrides: ``section.key=value`` each, the value in YAML
     :raises ConfigError: naming file or key, the value, and what is allowed
     """
-    reward, algorithm = os.fspath(reward), os.fspath(algorithm)
+    reward, algorithm, scenario = os.fspath(reward), os.fspath(algorithm), os.fspath(scenario)
     changes = _parse_overrides(overrides)
-    changed_fields = merge(scenario or {}, changes.get("scenario", {}))
-    world = _build_scenario(merge(library.load_section("scenario", "default"), changed_fields))
+    changed_fields = merge(fields or {}, changes.get("scenario", {}))
+    world = _build_scenario(merge(library.load_section("scenario", scenario), changed_fields))
     budget = profile if world.solvable_without_obstacles else f"{profile}_obstacles"
     sections = {
         "reward": library.load_reward(reward),
@@ -230,7 +232,9 @@ def load_config(
     merged = {name: merge(section, changes.get(name, {})) for name, section in sections.items()}
     named = merged["reward"].get("name")
     if named == Path(reward).stem and not re.match(METHOD_NAME, named):
-        raise ConfigError(f"{reward}: {named!r:.80} cannot name a method; add 'name:' with letters, digits, _ . or -")
+        raise ConfigError(
+            f"{reward}: {named!r:.80} is not a valid method name; add 'name:' with letters, digits, _ . or -"
+        )
     return _checked(world, merged)
 
 
@@ -256,8 +260,8 @@ def check_training(config: Config) -> None:
     random, total = config.algorithm.random_world_steps, config.training.world_steps
     if random >= total:
         raise ConfigError(
-            f"algorithm.random_world_steps: nothing would be learnt, as the training ends after {total} world steps "
-            f"(training.world_steps); got {random}"
+            f"algorithm.random_world_steps: must be less than training.world_steps, {total}, or nothing would be learnt; "
+            f"got {random}"
         )
     _check_memory(config)
 
@@ -323,9 +327,10 @@ def _build_scenario(values: Mapping[str, Any]) -> Scenario:
     try:
         return Scenario(**{**values, "observe_extras": tuple(extras) if isinstance(extras, list) else extras})
     except ValueError as error:
-        raise ConfigError(f"scenario.{error}") from error
+        about_a_field = str(error).split()[0] in known
+        raise ConfigError(f"scenario{'.' if about_a_field else ': '}{error}") from error
     except OverflowError as error:
-        raise ConfigError("scenario: the bodies cover more of the scene than a number can tell") from error
+        raise ConfigError("scenario: the bodies are too large for the scene") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
@@ -399,8 +404,8 @@ def _check_memory(config: Config) -> None:
     installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > installed:
         raise ConfigError(
-            f"algorithm.buffer_world_steps, training.n_worlds: {needed / 1e9:.1f} GB would be needed, "
-            f"this machine has {installed / 1e9:.1f} GB"
+            f"algorithm.buffer_world_steps, training.n_worlds: {needed / 1e9:.1f} GB of memory needed, "
+            f"but this machine has {installed / 1e9:.1f} GB"
         )
 
 

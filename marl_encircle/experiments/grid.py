@@ -1,7 +1,7 @@
 """A grid file -> the runs it asks for: methods x settings x seeds."""
 
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
 
@@ -31,6 +31,7 @@ class Group(Section):
     """Every method in every setting with every seed."""
 
     methods: list[str]
+    algorithm: str = "maddpg"
     settings: list[SettingConfig]
     seeds: list[Annotated[int, Field(ge=0, lt=1 << 32)]]
 
@@ -47,6 +48,7 @@ class GridConfig(Section):
     """A grid file."""
 
     profile: Profile
+    scenario: str = "default"
     groups: list[Group]
     shared: list[Shared]
 
@@ -58,16 +60,27 @@ class Job(NamedTuple):
     setting: Setting
     seed: int
     profile: Profile
+    scenario: str = "default"
+    algorithm: str = "maddpg"
+    overrides: tuple[str, ...] = ()
 
     @property
     def config(self) -> Config:
         """The run's configuration."""
-        return _config(self.reward, self.setting, self.profile)
+        return _config(self._replace(seed=0))
 
 
 @lru_cache(maxsize=1024)
-def _config(reward: str, setting: Setting, profile: Profile) -> Config:
-    return load_config(reward, profile=profile, scenario=setting._asdict())
+def _config(job: Job) -> Config:
+    """Return the configuration that the runs of all seeds have in common."""
+    return load_config(
+        job.reward,
+        algorithm=job.algorithm,
+        profile=job.profile,
+        scenario=job.scenario,
+        fields=job.setting._asdict(),
+        overrides=job.overrides,
+    )
 
 
 class Grid(NamedTuple):
@@ -80,7 +93,7 @@ class Grid(NamedTuple):
 def load_grid(name: str) -> Grid:
     """Return the runs of a grid in the file's order, each once, none of a cell that shares another's.
 
-    :param name: a name in ``configs/paper/`` or the path of a YAML file; paths of methods in it are relative to it
+    :param name: a name in ``configs/paper/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
     """
     _config.cache_clear()
@@ -89,12 +102,17 @@ def load_grid(name: str) -> Grid:
         grid = GridConfig(**read_yaml(path))
     except ValidationError as error:
         raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, GridConfig))) from error
+
+    def beside(name: str) -> str:
+        return str(path.parent / name) if is_path(name) else name
+
     jobs: dict[Job, None] = {}
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
-        for method in (str(path.parent / name) if is_path(name) else name for name in group.methods):
+        for method in map(beside, group.methods):
             for setting in (Setting(**column.model_dump()) for column in group.settings):
-                config = _config(method, setting, grid.profile)
+                first = Job(method, setting, 0, grid.profile, beside(grid.scenario), beside(group.algorithm))
+                config = first.config
                 try:
                     for seed in group.seeds:
                         check_seed(config, seed)
@@ -105,15 +123,19 @@ def load_grid(name: str) -> Grid:
                 if owner is not None:
                     aliases[cell] = Cell(owner, setting)
                     continue
-                jobs |= dict.fromkeys(Job(method, setting, seed, grid.profile) for seed in group.seeds)
+                jobs |= dict.fromkeys(first._replace(seed=seed) for seed in group.seeds)
     owners: dict[Cell, str] = {}
     for job in jobs:
         reward = owners.setdefault(job.config.cell, job.reward)
         if reward != job.reward:
-            raise ConfigError(f"{path}: the methods {reward} and {job.reward} have one name, {job.config.reward.name}")
+            raise ConfigError(
+                f"{path}: the methods {reward} and {job.reward} have the same name, {job.config.reward.name}"
+            )
     for cell, shared in aliases.items():
         if shared not in owners:
-            raise ConfigError(f"{path}: shared: {cell.method} has the runs of {shared.method}, which the grid lacks")
+            raise ConfigError(
+                f"{path}: shared: {cell.method} takes the runs of {shared.method}, which is not in the grid"
+            )
     return Grid(tuple(jobs), aliases)
 
 
@@ -126,5 +148,8 @@ def _owner(cell: Cell, shared: list[Shared]) -> str | None:
 
 def arguments(job: Job) -> list[str]:
     """Return the command-line arguments of ``marl-encircle train`` for a job."""
-    flags: dict[str, Any] = {"reward": job.reward, **job.setting._asdict(), "seed": job.seed, "profile": job.profile}
-    return [part for name, value in flags.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    setting = job.setting._asdict()
+    options = {name: value for name, value in job._asdict().items() if name not in ("setting", "overrides")}
+    flags = [(name.replace("_", "-"), str(value)) for name, value in (options | setting).items()]
+    flags += [("set", override) for override in job.overrides]
+    return [part for name, value in flags for part in (f"--{name}", value)]

@@ -92,7 +92,7 @@ def render_tables(runs: Iterable[Run], aliases: Mapping[Cell, Cell] | None = Non
     :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart
     :param aliases: cell -> the cell whose runs it shares when it has none of its own
     :return: file name -> text, each table as Markdown and CSV
-    :raises ValueError: when a training seed of a cell appears twice or its runs have different closure rules
+    :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
     """
     results = _by_cell(runs, aliases or {})
     paper = paper_results()
@@ -102,16 +102,16 @@ def render_tables(runs: Iterable[Run], aliases: Mapping[Cell, Cell] | None = Non
         cells = paper.get(name, every)
         closure: Closure | None = "all" if name == "table_common_rule" else None
         rows = [_result_row(cell, results.get(cell), cells.get(cell), closure) for cell in _ordered(cells, results)]
-        rendered[f"{name}.md"] = _markdown(title, _RESULT_HEADER, [_result_cells(row) for row in rows], _RESULT_NOTES)
+        rendered[f"{name}.md"] = markdown(title, _RESULT_HEADER, [_result_cells(row) for row in rows], _RESULT_NOTES)
         rendered[f"{name}.csv"] = _csv([_result_record(row) for row in rows])
     others = _by_method(results.keys() - set(_ordered(every, results)))
     if others:
         rows = [_result_row(cell, results[cell], None, None) for cell in others]
         title = "Settings that Tables 2-4 do not have"
-        rendered["table_other.md"] = _markdown(title, _OTHER_HEADER, [_other_cells(row) for row in rows], _OTHER_NOTES)
+        rendered["table_other.md"] = markdown(title, _OTHER_HEADER, [_other_cells(row) for row in rows], _OTHER_NOTES)
         rendered["table_other.csv"] = _csv([_result_record(row) for row in rows])
     differences = list(_difference_rows(every, results))
-    rendered["table_differences.md"] = _markdown(
+    rendered["table_differences.md"] = markdown(
         "Ours minus the others", _DIFFERENCE_HEADER, [_difference_cells(row) for row in differences], _DIFFERENCE_NOTES
     )
     rendered["table_differences.csv"] = _csv([_difference_record(row) for row in differences])
@@ -126,7 +126,7 @@ def render_table1(options: Mapping[str, MethodOptions]) -> dict[str, str]:
     """
     rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
     header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
-    return {"table1.md": _markdown("Table 1: Experimental model options", header, rows, [])}
+    return {"table1.md": markdown("Table 1: Experimental model options", header, rows, [])}
 
 
 def label(method: str) -> str:
@@ -175,7 +175,7 @@ def _by_cell(runs: Iterable[Run], aliases: Mapping[Cell, Cell]) -> dict[Cell, _C
     seen = set()
     for run in sorted(runs, key=lambda run: (run.cell, run.seed)):
         if (run.cell, run.seed) in seen:
-            raise ValueError(f"{_in_words(run.cell)}: training seed {run.seed} appears twice")
+            raise ValueError(f"{_in_words(run.cell)}: duplicate training seed {run.seed}")
         seen.add((run.cell, run.seed))
         entry = results.get(run.cell, _CellRuns(None, {}, {status: [] for status in OTHER_STATUSES}))
         if None not in (run.closure, entry.closure) and run.closure != entry.closure:
@@ -378,7 +378,8 @@ def _difference_record(row: _DifferenceRow) -> dict[str, str]:
     }
 
 
-def _markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
+def markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
+    """Write a table under its title, with notes below."""
     lines = [f"# {title}", "", _markdown_row(header), _markdown_row(["---"] * len(header)), *map(_markdown_row, rows)]
     if notes:
         lines += ["", *(f"- {note}" for note in notes)]

@@ -98,8 +98,8 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
         ({"pursuers": "3"}, "scenario.pursuers must be an integer"),
         ({"reward": "our"}, "did you mean ours?"),
         ({"overrides": ["training.n_world=3"]}, "did you mean n_worlds?"),
-        ({"engine": "nativ"}, "engine 'nativ': no such engine; did you mean native?"),
-        ({"engine": None}, "engine None: no such engine; known: native, supersuit"),
+        ({"engine": "nativ"}, "engine 'nativ': unknown engine; did you mean native?"),
+        ({"engine": None}, "engine None: unknown engine; known: native, supersuit"),
         ({"n_worlds": "8"}, "n_worlds must be an integer of at least 1; got '8'"),
         ({"n_worlds": 0}, "n_worlds must be an integer of at least 1; got 0"),
         ({"n_worlds": 2.0}, "n_worlds must be an integer of at least 1; got 2.0"),
@@ -123,7 +123,7 @@ def test_plain_maddpg_learns_in_these_worlds() -> None:
 
 
 def test_world_steps_become_the_pursuers_steps() -> None:
-    config = load_config(scenario={"pursuers": 4}, overrides=["algorithm.buffer_world_steps=1000"])
+    config = load_config(fields={"pursuers": 4}, overrides=["algorithm.buffer_world_steps=1000"])
     model = build_model(config, build_vec_env(config, 8), 3)
     assert model.learning_starts == 4 * 5000
     assert model.buffer_size == 4000
@@ -206,31 +206,31 @@ def write(name: str, content: bytes) -> Callable[[Path], object]:
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (lambda f: f.rename(f.with_name("gone")), "run.json: the file is missing"),
     "no record": (lambda f: (f / "run.json").unlink(), "run.json: the file is missing"),
-    "empty record": (write("run.json", b""), "run.json: is not valid JSON"),
+    "empty record": (write("run.json", b""), "run.json: not valid JSON"),
     "half a record": (
-        lambda f: write("run.json", (f / "run.json").read_bytes()[:900])(f), "run.json: is not valid JSON"),
-    "bytes": (write("run.json", b"\xff\xfe"), "run.json: is not valid JSON"),
-    "a list": (write("run.json", b"[1]"), "run.json: is not a JSON object"),
-    "nested": (write("run.json", b"[" * 100_000), "run.json: is not valid JSON"),
+        lambda f: write("run.json", (f / "run.json").read_bytes()[:900])(f), "run.json: not valid JSON"),
+    "bytes": (write("run.json", b"\xff\xfe"), "run.json: not valid JSON"),
+    "a list": (write("run.json", b"[1]"), "run.json: not a JSON object"),
+    "nested": (write("run.json", b"[" * 100_000), "run.json: not valid JSON"),
     "large": (write("run.json", b" " * (1 << 20) + b"{}"), "run.json: larger than"),
-    "no config": (lambda f: edit_record(f, lambda r: r.pop("config")), "run.json: lacks config"),
+    "no config": (lambda f: edit_record(f, lambda r: r.pop("config")), "run.json: missing config"),
     "config a list": (lambda f: edit_record(f, lambda r: r.update(config=[1])), "run.json: config is [1], not"),
     "config null": (lambda f: edit_record(f, lambda r: r.update(config=None)), "run.json: config is None"),
     "scenario a list": (lambda f: edit_record(f, lambda r: r["config"].update(scenario=[1])), "config.scenario is"),
     "no scenario": (lambda f: edit_record(f, lambda r: r["config"].pop("scenario")), "config.scenario is None"),
     "an edit": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=0.5), vouch=False),
         "run.json: config has changed since it was written"),
-    "no seed": (lambda f: edit_record(f, lambda r: r.pop("seed")), "run.json: lacks seed"),
+    "no seed": (lambda f: edit_record(f, lambda r: r.pop("seed")), "run.json: missing seed"),
     "seed null": (lambda f: edit_record(f, lambda r: r.update(seed=None)), "run.json: seed is None, not"),
     "a status": (lambda f: edit_record(f, lambda r: r.update(status="x")), "run.json: status is 'x', not"),
     "unknown key": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(x=1)), "reward.x: unknown key"),
     "nan": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=math.nan)), "reward.scale: "),
     "huge": (lambda f: edit_record(f, lambda r: r["config"]["algorithm"].update(net_arch=[4096] * 8)), "net_arch: the"),
-    "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json: lacks sha256"),
+    "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json: missing sha256"),
     "hashes a list": (lambda f: edit_record(f, lambda r: r.update(sha256=[])), "run.json: sha256 is [], not"),
     "no hash": (
         lambda f: edit_record(f, lambda r: r["sha256"].pop("policy.safetensors")),
-        "run.json: sha256 lacks policy.safetensors"),
+        "run.json: sha256 has no policy.safetensors"),
     "hash a number": (
         lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": 3})), "run.json: sha256 is"),
     "another hash": (

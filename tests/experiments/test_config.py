@@ -43,9 +43,7 @@ def write(folder: Path, name: str, text: str) -> str:
 def test_a_field_that_nobody_names_keeps_its_default_and_the_last_one_to_name_it_wins() -> None:
     assert load_config().scenario.safety_distance == 0.11
     scenario = {"safety_distance": 0.12, "pursuers": 4}
-    config = load_config(
-        scenario=scenario, overrides=["scenario.safety_distance=0.13", "scenario.safety_distance=0.14"]
-    )
+    config = load_config(fields=scenario, overrides=["scenario.safety_distance=0.13", "scenario.safety_distance=0.14"])
     assert (config.scenario.safety_distance, config.scenario.pursuers, config.scenario.obstacles) == (0.14, 4, 1)
 
 
@@ -71,7 +69,7 @@ def test_a_users_file_works_where_a_name_does_from_any_folder(tmp_path: Path, mo
 
 def test_a_file_whose_name_cannot_name_a_method_is_told_to_add_one(tmp_path: Path) -> None:
     path = write(tmp_path, "my idea.yaml", "base: ours\n")
-    assert refused(path) == f"{path}: 'my idea' cannot name a method; add 'name:' with letters, digits, _ . or -"
+    assert refused(path) == f"{path}: 'my idea' is not a valid method name; add 'name:' with letters, digits, _ . or -"
     assert load_config(path, overrides=["reward.name=said"]).reward.name == "said"
     assert load_config(write(tmp_path, "my idea.yaml", "base: ours\nname: idea\n")).reward.name == "idea"
 
@@ -91,7 +89,7 @@ def test_the_curriculum_follows_from_eq_6_for_every_method_alike(
     ratio: float, pursuers: int, alone: bool, profile: Any
 ) -> None:
     for method in ("ours", "model_a", "ma2019"):
-        config = load_config(method, profile=profile, scenario={"speed_ratio": ratio, "pursuers": pursuers})
+        config = load_config(method, profile=profile, fields={"speed_ratio": ratio, "pursuers": pursuers})
         ramps = {name for name, ramp in config.training.curriculum.items() if ramp is not None}
         assert ramps == ({"safety_distance"} if alone else {"obstacle_radius", "speed_ratio"})
         longer = config.training.world_steps > 1_000_000
@@ -100,7 +98,7 @@ def test_the_curriculum_follows_from_eq_6_for_every_method_alike(
 
 def test_null_switches_the_curriculum_off() -> None:
     for pursuers in (2, 3):
-        config = load_config(scenario={"pursuers": pursuers}, overrides=["training.curriculum=null"])
+        config = load_config(fields={"pursuers": pursuers}, overrides=["training.curriculum=null"])
         assert config.to_dict()["training"]["curriculum"] == {}
         assert Config.from_dict(config.to_dict()) == config
 
@@ -110,7 +108,7 @@ def test_null_switches_the_curriculum_off() -> None:
 
 def test_a_runs_folder_tells_method_and_setting_exactly() -> None:
     def folder(**scenario: Any) -> str:
-        return str(run_folder(load_config("model_b", scenario=scenario), 7, "out"))
+        return str(run_folder(load_config("model_b", fields=scenario), 7, "out"))
 
     assert folder() == "out/model_b/ratio1.1_n3_m1_random/seed7"
     assert folder(speed_ratio=1, obstacles=0) == "out/model_b/ratio1.0_n3_m0_random/seed7"
@@ -288,9 +286,9 @@ def test_every_fault_of_a_file_is_told_at_once() -> None:
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
-    assert "is no file" in refused(str(tmp_path / "folder.yaml"))
+    assert "not a regular file" in refused(str(tmp_path / "folder.yaml"))
     os.mkfifo(tmp_path / "pipe.yaml")
-    assert "is no file" in refused(str(tmp_path / "pipe.yaml"))
+    assert "not a regular file" in refused(str(tmp_path / "pipe.yaml"))
     assert "No such file" in refused(str(tmp_path / "absent.yaml"))
     assert "No such file" in refused("ablations/absent.yml")
 
@@ -305,7 +303,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_what_would_not_fit_into_memory_is_refused(overrides: Sequence[str]) -> None:
     config = load_config(overrides=overrides)  # which may be shown, and its environment built
-    with pytest.raises(ConfigError, match="GB would be needed, this machine has"):
+    with pytest.raises(ConfigError, match="GB of memory needed, but this machine has"):
         check_training(config)
 
 
@@ -318,12 +316,12 @@ def test_a_buffer_is_no_larger_than_its_training() -> None:
 def test_a_training_without_learning_is_refused(profile: Any, pursuers: int) -> None:
     def check(random: int) -> None:
         how = [f"algorithm.random_world_steps={random}", "training.world_steps=12000"]
-        check_training(load_config(profile=profile, scenario={"pursuers": pursuers}, overrides=how))
+        check_training(load_config(profile=profile, fields={"pursuers": pursuers}, overrides=how))
 
-    check_training(load_config(profile=profile, scenario={"pursuers": pursuers}))
+    check_training(load_config(profile=profile, fields={"pursuers": pursuers}))
     check(11999)
     for random in (12000, 20000):
-        with pytest.raises(ConfigError, match=f"random_world_steps: nothing would be learnt.*12000.*; got {random}"):
+        with pytest.raises(ConfigError, match=f"random_world_steps: must be less than .*, 12000, or nothing would be learnt; got {random}"):
             check(random)
 
 
