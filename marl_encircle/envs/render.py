@@ -7,7 +7,7 @@ The panel on the right puts the same measures into figures.
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,6 +17,22 @@ from numpy.typing import NDArray
 from marl_encircle.core.geometry import NOBODY, Closure
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
+from marl_encircle.envs.outlines import borders, facing_arc, polar, stretches, wedges
+from marl_encircle.envs.palette import (
+    BACKGROUND,
+    FAINT,
+    GOOD,
+    GROOVE,
+    INK,
+    LINE,
+    OBSTACLE,
+    OBSTACLE_EDGE,
+    PAPER,
+    Colour,
+    entity_colour,
+    pursuer_colour,
+    readable_on,
+)
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 try:
@@ -25,7 +41,6 @@ except ImportError as error:
     raise ImportError("drawing needs pygame-ce: pip install 'marl-encircle[render]'") from error
 
 Array = NDArray[np.float64]
-Colour = tuple[int, int, int]
 
 SCENE = 720
 """Side of the scene [pixels]."""
@@ -35,27 +50,6 @@ PANEL = 260
 
 SUPERSAMPLING = 2
 """Everything is drawn this many times as large and then scaled down, which smooths edges and letters."""
-
-PURSUERS: tuple[Colour, ...] = (
-    (0, 114, 178),
-    (230, 159, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-    (86, 180, 233),
-    (213, 94, 0),
-    (240, 228, 66),
-)
-"""Okabe and Ito's colours, which colour-blind people tell apart; an eighth pursuer has the first one's again."""
-
-INK: Colour = (34, 34, 38)
-FAINT: Colour = (122, 122, 128)
-LINE: Colour = (214, 214, 216)
-PAPER: Colour = (255, 255, 255)
-BACKGROUND: Colour = (246, 246, 244)
-GROOVE: Colour = (236, 236, 234)
-OBSTACLE: Colour = (150, 150, 154)
-OBSTACLE_EDGE: Colour = (104, 104, 110)
-GOOD: Colour = (0, 122, 89)
 
 
 class View(NamedTuple):
@@ -193,8 +187,7 @@ class _Scene:
     def _polar(self, angles: NDArray[np.floating[Any]], distances: Array) -> list[tuple[float, float]]:
         """Return pixels at these angles and distances from the target."""
         distances = np.minimum(distances, 4 * self.view.scenario.half_width)  # far outside of the picture
-        points = self.view.target + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        return [self._pixel(point) for point in points]
+        return [self._pixel(place) for place in polar(self.view.target, angles, distances)]
 
     def _draw_ground(self) -> None:
         self.surface.fill(BACKGROUND)
@@ -207,24 +200,17 @@ class _Scene:
 
     def _draw_wedges(self) -> None:
         """Tint what the target can reach before it is met, in the colour of who meets it there."""
-        closed = math.isfinite(self.view.movement_range)
+        view, closed = self.view, math.isfinite(self.view.movement_range)
         layer = pygame.Surface((self.side, self.side), pygame.SRCALPHA)
-        centre = self._pixel(self.view.target)
-        count = len(self.view.owner)
-        for owner, directions in _runs(self.view.owner):
-            if owner == NOBODY:
-                continue
-            distances = self.view.distance[directions % count]
-            if closed:  # meet the neighbours half-way
-                outside = self.view.distance[[directions[0] - 1, (directions[-1] + 1) % count]]
-                ends = (distances[[0, -1]] + outside) / 2
-            else:
-                ends = distances[[0, -1]]
-            pixels = self._polar(_borders(directions, count), np.concatenate([ends[:1], distances, ends[1:]]))
-            pygame.draw.polygon(layer, (*colour_of(owner, self.view), 110 if closed else 42), [centre, *pixels])
+        centre = self._pixel(view.target)
+        for wedge in wedges(view.owner, view.distance, closed):
+            colour = entity_colour(wedge.owner, view.scenario.pursuers)
+            pixels = self._polar(wedge.angles, wedge.distances)
+            pygame.draw.polygon(layer, (*colour, 110 if closed else 42), [centre, *pixels])
         self.surface.blit(layer, (0, 0))
         if closed:
-            outline = self._polar(np.arange(count) * (2 * np.pi / count), self.view.distance)
+            count = len(view.owner)
+            outline = self._polar(np.arange(count) * (2 * np.pi / count), view.distance)
             pygame.draw.lines(self.surface, INK, True, outline, 2 * SUPERSAMPLING)
 
     def _draw_trails(self) -> None:
@@ -233,7 +219,7 @@ class _Scene:
         layer = pygame.Surface((self.side, self.side), pygame.SRCALPHA)
         path = np.stack(self.view.trail)
         for body in range(path.shape[1]):
-            colour = colour_of(body, self.view) if body < path.shape[1] - 1 else INK
+            colour = pursuer_colour(body) if body < path.shape[1] - 1 else INK
             pixels = [self._pixel(place) for place in path[:, body]]
             for age, (start, end) in enumerate(zip(pixels[-2::-1], pixels[:0:-1], strict=True)):
                 opacity = max(40, 190 - 6 * age)
@@ -250,14 +236,10 @@ class _Scene:
         """Draw the part of each Apollonius circle that faces the target."""
         ratio = self.view.speed_ratio
         for i, offset in enumerate(self.view.pursuers - self.view.target):
-            way = float(np.hypot(*offset))
-            if way == 0.0:
+            if np.hypot(*offset) == 0.0:
                 continue
-            widest = math.asin(1 / ratio)
-            phi = np.linspace(-widest, widest, 181)
-            distance = ratio * way / (ratio * np.cos(phi) + np.sqrt(np.maximum(1 - (ratio * np.sin(phi)) ** 2, 0.0)))
-            pixels = self._polar(phi + math.atan2(offset[1], offset[0]), distance)
-            pygame.draw.lines(self.surface, colour_of(i, self.view), False, pixels, SUPERSAMPLING)
+            pixels = self._polar(*facing_arc(offset, ratio))
+            pygame.draw.lines(self.surface, pursuer_colour(i), False, pixels, SUPERSAMPLING)
 
     def _draw_ring(self) -> None:
         unit = max(self.view.scenario.target_radius, 0.02 * self.view.scenario.half_width) * self.scale
@@ -282,10 +264,10 @@ class _Scene:
                 arrow = [(x + r * math.cos(angle + turn), y + r * math.sin(angle + turn)) for r, turn in corners]
                 pygame.draw.polygon(self.surface, INK, arrow)
             pygame.draw.circle(self.surface, INK, (x, y), radius)
-            pygame.draw.circle(self.surface, colour_of(i, self.view), (x, y), radius - 2 * SUPERSAMPLING)
+            pygame.draw.circle(self.surface, pursuer_colour(i), (x, y), radius - 2 * SUPERSAMPLING)
             size = int(1.3 * radius / SUPERSAMPLING)
             if size >= 8:
-                _write(self.surface, str(i), (x, y), size, _readable_on(colour_of(i, self.view)), 0.5)
+                _write(self.surface, str(i), (x, y), size, readable_on(pursuer_colour(i)), 0.5)
 
 
 class _Panel:
@@ -358,7 +340,7 @@ class _Panel:
 def _shares(view: View) -> list[tuple[str, float, Colour]]:
     """Return label, share of the circle and colour of every pursuer, and of the obstacles together."""
     n = view.scenario.pursuers
-    shares = [(str(i), float((view.owner == i).mean()), colour_of(i, view)) for i in range(n)]
+    shares = [(str(i), float((view.owner == i).mean()), pursuer_colour(i)) for i in range(n)]
     if len(view.discs):
         shares.append(("obst.", float((view.owner >= n).mean()), OBSTACLE))
     return shares
@@ -366,36 +348,13 @@ def _shares(view: View) -> list[tuple[str, float, Colour]]:
 
 def _draw_ring(surface: Any, view: View, centre: tuple[float, float], inner: float, outer: float) -> None:
     """Draw a ring whose segments have the colours of who owns these directions; nobody's are left pale."""
-    for owner, directions in _runs(view.owner):
-        angles = _borders(directions, len(view.owner))
+    for owner, directions in stretches(view.owner):
+        angles = borders(directions, len(view.owner))
         fine = np.linspace(angles[0], angles[-1], 6 * len(angles))
         unit = np.stack([np.cos(fine), -np.sin(fine)], axis=1)
         outline = np.concatenate([centre + outer * unit, centre + inner * unit[::-1]])
-        pygame.draw.polygon(surface, LINE if owner == NOBODY else colour_of(owner, view), outline.tolist())
-
-
-def _runs(owner: NDArray[np.int8]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each stretch of neighbouring directions with one owner; numbers go on beyond the full circle."""
-    changes = np.flatnonzero(owner != np.roll(owner, 1))
-    starts = changes.tolist() or [0]
-    for start, end in zip(starts, [*starts[1:], starts[0] + len(owner)], strict=True):
-        yield int(owner[start]), np.arange(start, end)
-
-
-def _borders(directions: NDArray[np.int64], count: int) -> Array:
-    """Return the angles of a stretch of directions, and of its two borders."""
-    return np.concatenate([[directions[0] - 0.5], directions, [directions[-1] + 0.5]]) * (2 * np.pi / count)
-
-
-def colour_of(owner: int, view: View) -> Colour:
-    """Return the colour of a pursuer or an obstacle."""
-    return PURSUERS[owner % len(PURSUERS)] if owner < view.scenario.pursuers else OBSTACLE
-
-
-def _readable_on(colour: Colour) -> Colour:
-    """Return black or white, whichever stands out more."""
-    red, green, blue = colour
-    return INK if 0.299 * red + 0.587 * green + 0.114 * blue > 140 else PAPER
+        colour = LINE if owner == NOBODY else entity_colour(owner, view.scenario.pursuers)
+        pygame.draw.polygon(surface, colour, outline.tolist())
 
 
 def _write(surface: Any, text: str, place: tuple[float, float], size: int, colour: Colour, align: float) -> None:

@@ -11,7 +11,7 @@ import pygame
 import pytest
 from pettingzoo_tests import render_test
 
-from marl_encircle.envs import encirclement_v0, render
+from marl_encircle.envs import encirclement_v0, palette, render
 from marl_encircle.envs.encirclement_v0 import parallel_env
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 
@@ -114,10 +114,10 @@ def test_bodies_are_drawn_where_they_are() -> None:
     state.discs[0, 0] = [0.5, -0.5, 0.2]
     picture = render.picture(render.view(env.simulator, "all"))
     first, second = picture[189, 531 + 12], picture[189, 189 + 12]  # beside their numbers
-    assert tuple(first) == render.PURSUERS[0]
-    assert tuple(second) == render.PURSUERS[1]
-    assert tuple(picture[531, 189]) == render.INK
-    assert tuple(picture[531, 531]) == render.OBSTACLE
+    assert tuple(first) == palette.PURSUERS[0]
+    assert tuple(second) == palette.PURSUERS[1]
+    assert tuple(picture[531, 189]) == palette.INK
+    assert tuple(picture[531, 531]) == palette.OBSTACLE
 
 
 def test_a_closed_enclosure_is_shaded_and_an_open_one_is_not_outlined() -> None:
@@ -131,7 +131,7 @@ def test_a_closed_enclosure_is_shaded_and_an_open_one_is_not_outlined() -> None:
         state.velocities[:] = 0.0
         sim.set_state(sim.get_state())  # measures what was moved by hand
         picture = render.picture(render.view(sim, "all"))[:, : render.SCENE]
-        return int((picture == render.INK).all(axis=2).sum())
+        return int((picture == palette.INK).all(axis=2).sum())
 
     closed = inked(around)
     assert np.isfinite(sim.measure.enclosure["all"].movement_range[0])
@@ -145,13 +145,13 @@ def test_nothing_is_drawn_into_the_panel_by_the_scene() -> None:
     env.simulator.state.pursuers[0] = [[1.0, 1.0], [1.0, 0.0], [1.0, -1.0]]
     with_bodies = render.picture(render.view(env.simulator, "all"))
     border = with_bodies[:, render.SCENE + 1]
-    assert (border == render.PAPER).all()
+    assert (border == palette.PAPER).all()
 
 
 def test_colours_differ_also_in_brightness_or_hue_for_colour_blind_eyes() -> None:
     # Pictures as seen without red cones (Vienot, Brettel and Mollon 1999), linear RGB.
     to_dichromat = np.array([[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]])
-    colours = (np.array([*render.PURSUERS, render.OBSTACLE, render.INK]) / 255.0) ** 2.2
+    colours = (np.array([*palette.PURSUERS, palette.OBSTACLE, palette.INK]) / 255.0) ** 2.2
     seen = np.clip(colours @ to_dichromat.T, 0, 1) ** (1 / 2.2)
     distance = np.linalg.norm(seen[:, None] - seen[None], axis=2) + np.eye(len(seen))
     assert distance.min() > 0.08
