@@ -139,9 +139,7 @@ def evaluate(
     episodes = own_rounds[0] if episodes is None else episodes
     seed = own_rounds[1] if seed is None else seed
     if seed == record["seed"]:
-        raise ConfigError(
-            f"--seed {seed} is the run's training seed: the policy was trained in these worlds; choose another seed"
-        )
+        raise ConfigError(f"--seed {seed} is the run's training seed: its policy has seen these worlds; choose another")
     if write and record["status"] != "finished":
         raise ConfigError(f"--write needs a finished run; the status of {run_dir} is {record['status']}")
     if write and (episodes, seed) != own_rounds:

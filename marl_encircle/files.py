@@ -201,7 +201,7 @@ def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | 
         raise DamagedFileError(path, f"larger than the {max_bytes} bytes allowed")
     if sha256 is not None and sha256_bytes(data) != sha256:
         raise DamagedFileError(
-            path, f"changed since it was written: sha256 {sha256_bytes(data)}, written as {sha256[:80]}"
+            path, f"changed since it was written: sha256 is {sha256_bytes(data)}, expected {sha256[:80]}"
         )
     return data
 

@@ -23,7 +23,7 @@ class FolderLockedError(RuntimeError):
 
     def __init__(self, folder: str | Path, pid: int | None, host: str | None) -> None:
         holder = "another process" if pid is None else f"process {pid} on host {host}"
-        super().__init__(f"{folder}: {holder} works in this folder; wait for it to end or choose another folder")
+        super().__init__(f"{folder}: {holder} is using this folder; wait for it to finish or choose another folder")
         self.folder = Path(folder)
         self.pid = pid
         self.host = host

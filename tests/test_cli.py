@@ -272,7 +272,7 @@ def test_a_diverged_run_is_evaluated_with_a_warning_and_not_written(run: Run, ru
     assert "warning: this run diverged" in done.err
     done = run("evaluate", folder, "--write")
     assert (done.code, done.out) == (2, "")
-    assert "its status is diverged" in done.err
+    assert "is diverged" in done.err
     assert (everything_in(folder), (folder / "run.json").read_bytes()) == before
 
 
@@ -483,4 +483,4 @@ def test_the_module_is_the_command(tmp_path: Path, module: str) -> None:
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: reward 'our': neither a known name nor the path of a .yaml file; did you mean ours?\n"
+    assert done.stderr == "error: reward 'our': neither a known name nor a .yaml path; did you mean ours?\n"

@@ -107,7 +107,7 @@ def test_a_lock_whose_holder_removed_it_just_now_is_not_taken_for_the_new_one(
 def test_a_lock_that_says_nothing_readable_still_locks(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
     (tmp_path / ".lock").write_bytes(b"\xff[")
     with (
-        pytest.raises(locks.FolderLockedError, match="another process works in this folder"),
+        pytest.raises(locks.FolderLockedError, match="another process is using this folder"),
         locks.folder_lock(tmp_path),
     ):
         pass

@@ -31,7 +31,7 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
     """
 
     def __init__(self, signum: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(signum).name}; the same command goes on from here")
+        super().__init__(f"stopped by {signal.Signals(signum).name}; run the same command again to resume")
         self.signum = signum
 
 

@@ -54,7 +54,7 @@ def load_tree(path: Path) -> dict[str, Any]:
             raise ValueError("its tree has changed since it was written")
         restored: dict[str, Any] = _put_arrays(json.loads(text), arrays)
     except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise files.DamagedFileError(path, f"is no checkpoint: {str(error)[:200]}") from error
+        raise files.DamagedFileError(path, f"not a valid checkpoint: {str(error)[:200]}") from error
     return restored
 
 

@@ -232,9 +232,7 @@ def load_config(
     merged = {name: merge(section, changes.get(name, {})) for name, section in sections.items()}
     named = merged["reward"].get("name")
     if named == Path(reward).stem and not re.match(METHOD_NAME, named):
-        raise ConfigError(
-            f"{reward}: {named!r:.80} is not a valid method name; add 'name:' with letters, digits, _ . or -"
-        )
+        raise ConfigError(f"{reward}: {named!r:.80} is not a method name; add 'name:' with letters, digits, _ . or -")
     return _checked(world, merged)
 
 
@@ -260,8 +258,8 @@ def check_training(config: Config) -> None:
     random, total = config.algorithm.random_world_steps, config.training.world_steps
     if random >= total:
         raise ConfigError(
-            f"algorithm.random_world_steps: must be less than training.world_steps, {total}, or nothing would be learnt; "
-            f"got {random}"
+            f"algorithm.random_world_steps: must be less than training.world_steps, {total}, or nothing is "
+            f"learnt; got {random}"
         )
     _check_memory(config)
 

@@ -128,14 +128,10 @@ def load_grid(name: str) -> Grid:
     for job in jobs:
         reward = owners.setdefault(job.config.cell, job.reward)
         if reward != job.reward:
-            raise ConfigError(
-                f"{path}: the methods {reward} and {job.reward} have the same name, {job.config.reward.name}"
-            )
+            raise ConfigError(f"{path}: {reward} and {job.reward} have the same method name, {job.config.reward.name}")
     for cell, shared in aliases.items():
         if shared not in owners:
-            raise ConfigError(
-                f"{path}: shared: {cell.method} takes the runs of {shared.method}, which is not in the grid"
-            )
+            raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
     return Grid(tuple(jobs), aliases)
 
 

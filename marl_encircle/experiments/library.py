@@ -53,7 +53,7 @@ def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
         return Path(name)
     known = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
     if name not in known:
-        raise ConfigError(f"{kind} {name!r:.80}: no such name, and no path of a .yaml file{nearest(name, known)}")
+        raise ConfigError(f"{kind} {name!r:.80}: neither a known name nor a .yaml path{nearest(name, known)}")
     return known[name]
 
 
@@ -72,9 +72,9 @@ def _load(path: Path, folders: Iterable[Path], kind: str, seen: tuple[str, ...] 
     """Read a file on top of its base's."""
     real = os.path.realpath(path)
     if real in seen:
-        raise ConfigError(f"{path}: its base leads back to itself")
+        raise ConfigError(f"{path}: circular base; it leads back to this file")
     if len(seen) > MAX_BASES:
-        raise ConfigError(f"{path}: more than {MAX_BASES} bases on top of each other")
+        raise ConfigError(f"{path}: more than {MAX_BASES} nested bases")
     values = read_yaml(path)
     base = values.pop("base", None)
     if base is None:

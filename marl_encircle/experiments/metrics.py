@@ -132,7 +132,7 @@ def summarise_run(episodes: Sequence[Episode], closure: Closure) -> RunSummary:
 
     :param episodes: the run's evaluation rounds
     :param closure: rule that counts as success
-    :raises ValueError: without rounds or with a round number that comes twice
+    :raises ValueError: without rounds or with a duplicate round number
     """
     lengths = _lengths(episodes, closure)
     sigmas, solved_sigmas = _sigmas(episodes), _solved_sigmas(episodes, closure)
@@ -354,6 +354,6 @@ def _values(episodes: Sequence[Episode], value: Callable[[Episode], float | None
     if not episodes:
         raise ValueError("no evaluation rounds")
     if len({episode.round for episode in episodes}) != len(episodes):
-        raise ValueError("a round number comes twice")
+        raise ValueError("duplicate round number")
     pairs = ((_key(episode), value(episode)) for episode in episodes)
     return {key: float(value) for key, value in pairs if value is not None}

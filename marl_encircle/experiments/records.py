@@ -116,7 +116,7 @@ def episodes_from_csv(text: str) -> list[Episode]:
 
     :param text: content of the file
     :raises ValueError: for another header, a value of the wrong kind or out of range, with line and column; without
-        rounds; for a round number that appears twice
+        rounds; for a duplicate round number
     """
     try:
         lines = list(csv.reader(io.StringIO(text)))
@@ -128,7 +128,7 @@ def episodes_from_csv(text: str) -> list[Episode]:
     if not episodes:
         raise ValueError("no rounds")
     if len({episode.round for episode in episodes}) != len(episodes):
-        raise ValueError("a round number appears twice")
+        raise ValueError("duplicate round number")
     return episodes
 
 
@@ -152,7 +152,7 @@ def _cell(cell: str, kind: object, where: str) -> int | float | None:
     try:
         value = float(cell) if kind is float else int(cell)
     except ValueError:
-        raise ValueError(f"{where}: {cell[:80]!r} is not a {'number' if kind is float else 'whole number'}") from None
+        raise ValueError(f"{where}: {cell[:80]!r} is not {'a number' if kind is float else 'an integer'}") from None
     if not (math.isfinite(value) if kind is float else 0 <= value < 1 << 63):
         raise ValueError(f"{where}: {cell[:80]!r} is out of range")
     return value
@@ -244,7 +244,7 @@ def _check_place(path: Path, record: Mapping[str, Any], cell: Cell, seed: int) -
         **recorded,
     }.items():
         if value != expected:
-            raise files.DamagedFileError(path, f"{key} is {value!r:.80}, in the folder of {expected!r}")
+            raise files.DamagedFileError(path, f"{key} is {value!r:.80}, but its folder says {expected!r}")
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -260,7 +260,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise files.DamagedFileError(path, f"is not valid JSON: {error}") from error
+        raise files.DamagedFileError(path, f"not valid JSON: {error}") from error
     reason = _fault(record)
     if reason is not None:
         raise files.DamagedFileError(path, reason)
@@ -275,14 +275,14 @@ def config_hash(config: Mapping[str, Any]) -> str:
 def _fault(record: Any) -> str | None:
     """Say what is wrong with the content of a ``run.json``; None if nothing is."""
     if not isinstance(record, dict):
-        return "is not a JSON object"
+        return "not a JSON object"
     missing = [key for key in _RECORD_KEYS if key not in record]
     if missing:
-        return f"lacks {', '.join(missing)}"
+        return f"missing {', '.join(missing)}"
     if record["status"] not in ("finished", "diverged"):
         return f"status is {record['status']!r:.80}, not finished or diverged"
     if not _is_count(record["seed"], 0):
-        return f"seed is {record['seed']!r:.80}, not a whole number from 0"
+        return f"seed is {record['seed']!r:.80}, not an integer of at least 0"
     return _fault_of_config(record["config"], record["config_hash"]) or _fault_of_hashes(record["sha256"])
 
 
@@ -299,7 +299,7 @@ def _fault_of_config(config: Any, recorded_hash: Any) -> str | None:
         return f"config.reward.closure is {closure!r:.80}, not all or pursuers"
     for key, least in (("episodes", 1), ("seed", 0)):
         if not _is_count(evaluation.get(key), least):
-            return f"config.evaluation.{key} is {evaluation.get(key)!r:.80}, not a whole number from {least}"
+            return f"config.evaluation.{key} is {evaluation.get(key)!r:.80}, not an integer of at least {least}"
     return None
 
 
@@ -308,8 +308,8 @@ def _fault_of_hashes(hashes: Any) -> str | None:
         return f"sha256 is {hashes!r:.80}, not an object of file names and hashes"
     for name in hashes:
         if re.fullmatch(r"\w[\w.-]*", name) is None:
-            return f"sha256 has {name!r:.80}, which is not a plain file name"
-    return None if "policy.safetensors" in hashes else "sha256 lacks policy.safetensors"
+            return f"sha256 has {name!r:.80}, not a plain file name"
+    return None if "policy.safetensors" in hashes else "sha256 has no policy.safetensors"
 
 
 def _is_count(value: Any, least: int) -> bool:

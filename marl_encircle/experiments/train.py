@@ -240,4 +240,4 @@ def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> N
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)
-        raise OtherRunError(f"{folder} holds another run; give it another name or folder:\n  {listing}")
+        raise OtherRunError(f"{folder} already holds a different run; choose another name or folder:\n  {listing}")

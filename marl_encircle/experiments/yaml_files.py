@@ -1,6 +1,6 @@
 """YAML as this project reads it: plain data in one small file, everything else refused before it is parsed further.
 
-YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a key that comes twice is an error.
+YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a duplicate key is an error.
 """
 
 import datetime
@@ -37,7 +37,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         mappings, lists, strings, finite numbers, booleans and null
     """
     if path.exists() and not path.is_file():  # what is no file may never end
-        raise ConfigError(f"{path}: is no file")
+        raise ConfigError(f"{path}: not a regular file")
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -52,7 +52,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     if not isinstance(value, dict):
-        raise ConfigError(f"{path}: must hold keys and values; got {value!r:.80}")
+        raise ConfigError(f"{path}: must be a mapping of keys to values; got {value!r:.80}")
     return value
 
 
@@ -71,27 +71,30 @@ def parse_yaml(text: str) -> Any:
     except (YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"not YAML: {_in_short(str(error) or type(error).__name__)}") from error
+        raise ConfigError(f"not valid YAML: {_in_short(str(error) or type(error).__name__)}") from error
     _check_plain(value, "")
     return value
 
 
 def _in_short(reason: str) -> str:
     """First line of what ruamel says, without the values that it quotes in full."""
-    return reason.partition(" with value")[0].splitlines()[0][:120]
+    return reason.removeprefix("found ").partition(" with value")[0].splitlines()[0][:120]
 
 
 def _refuse_tricks(yaml: YAML, text: str) -> None:
     """Walk over the events, which costs little, before anything is built."""
-    depth = 0
+    depth = documents = 0
     for count, event in enumerate(yaml.parse(text)):
         where = f"line {event.start_mark.line + 1}"
         if isinstance(event, AliasEvent) or getattr(event, "anchor", None):
             raise ConfigError(f"{where}: anchors and aliases are not allowed; write the value out")
         if isinstance(event, DocumentStartEvent) and (event.version or event.tags):
             raise ConfigError(f"{where}: YAML directives are not allowed")
+        documents += isinstance(event, DocumentStartEvent)
+        if documents > 1:
+            raise ConfigError(f"{where}: more than one document")
         if isinstance(event, (ScalarEvent, MappingStartEvent, SequenceStartEvent)) and event.tag:
-            raise ConfigError(f"{where}: the tag {event.tag!s:.80} is not allowed; only plain values are")
+            raise ConfigError(f"{where}: the tag {event.tag!s:.80} is not allowed; only plain values")
         if isinstance(event, ScalarEvent) and event.value == "<<" and event.style is None:
             raise ConfigError(f"{where}: merge keys are not allowed; use 'base:'")
         depth += isinstance(event, (MappingStartEvent, SequenceStartEvent))
@@ -107,7 +110,7 @@ def _check_plain(value: Any, path: str) -> None:
     if isinstance(value, dict):
         for key, inner in value.items():
             if not isinstance(key, str):
-                raise ConfigError(f"{where}keys must be names; got {key!r:.80}")
+                raise ConfigError(f"{where}keys must be strings; got {key!r:.80}")
             _check_plain(inner, f"{path}.{key}" if path else key)
     elif isinstance(value, list):
         for i, inner in enumerate(value):
@@ -117,7 +120,7 @@ def _check_plain(value: Any, path: str) -> None:
     elif isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{where}must be finite; got {value}")
     elif not isinstance(value, (str, int, float, bool, type(None))):
-        raise ConfigError(f"{where}{value!r:.80} is no plain value")
+        raise ConfigError(f"{where}{value!r:.80} is not a plain value")
 
 
 def merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def test_a_missing_or_foreign_file_is_damaged(tmp_path: Path) -> None:
     for name, content in {"empty": b"", "text": b"hello", "zeros": bytes(200), "pickle": b"\x80\x04N."}.items():
         (tmp_path / name).write_bytes(content)
     for name in ("empty", "text", "zeros", "pickle", "absent"):
-        with pytest.raises(files.DamagedFileError, match=f"{name}: is no checkpoint"):
+        with pytest.raises(files.DamagedFileError, match=f"{name}: not a valid checkpoint"):
             load_tree(tmp_path / name)
 
 
@@ -75,7 +75,7 @@ def test_weights_without_a_tree_are_no_checkpoint(tmp_path: Path) -> None:
     import safetensors.numpy
 
     safetensors.numpy.save_file({"a": np.ones(2)}, tmp_path / "f")
-    with pytest.raises(files.DamagedFileError, match="is no checkpoint"):
+    with pytest.raises(files.DamagedFileError, match="not a valid checkpoint"):
         load_tree(tmp_path / "f")
 
 
@@ -85,7 +85,7 @@ def test_every_cut_is_noticed(tmp_path: Path) -> None:
     data = path.read_bytes()
     for length in {0, 1, 7, 8, 9, len(data) - 1, *random.Random(1).sample(range(len(data)), 100)}:
         path.write_bytes(data[:length])
-        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: is no checkpoint"):
+        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: not a valid checkpoint"):
             load_tree(path)
 
 
@@ -97,7 +97,7 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)
-        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: is no checkpoint"):
+        with pytest.raises(files.DamagedFileError, match=r"c\.safetensors: not a valid checkpoint"):
             load_tree(path)
 
 

@@ -84,7 +84,7 @@ def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
 
 def test_two_methods_of_one_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "ours.yaml").write_text("base: ours\nscale: 0.1\n")
-    with pytest.raises(ConfigError, match=r"the methods ours and .*ours\.yaml have the same name, ours"):
+    with pytest.raises(ConfigError, match=r": ours and .*ours\.yaml have the same method name, ours"):
         grid_of(tmp_path, GRID.format(method="ours.yaml"))
 
 
@@ -108,7 +108,7 @@ SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
         ("[2, 3, 2]", "[4294967296]", "groups.0.seeds.0: input should be less than 4294967296"),
         ("[2, 3, 2]", "[true]", "groups.0.seeds.0: input should be a valid integer; got True"),
         ("[2, 3, 2]", "3", "groups.0.seeds: input should be a valid list; got 3"),
-        ("[ours, ours]", "[ours, our]", "reward 'our': neither a known name nor the path of a .yaml file; did you mean ours?"),
+        ("[ours, ours]", "[ours, our]", "reward 'our': neither a known name nor a .yaml path; did you mean ours?"),
         ("shared: []", "shared: [{method: a, run_of: ours, obstacles: 0}]", "unknown key; did you mean runs_of?"),
         ("shared: []", "shared: [{method: ours, runs_of: model_a, obstacles: 1}]", "which is not in the grid"),
     ],

@@ -194,7 +194,7 @@ def test_a_cell_of_mixed_rules_or_seeds_twice_is_an_error_that_names_it() -> Non
         ValueError, match=r"ours at ratio 1\.1, n=3, m=1, random: its runs have different closure rules"
     ):
         tables.render_tables([finished("ours", ONE, 0, 5), finished("ours", ONE, 1, 5, closure="pursuers")])
-    with pytest.raises(ValueError, match="training seed 0 appears twice"):
+    with pytest.raises(ValueError, match="duplicate training seed 0"):
         tables.render_tables([finished("ours", ONE, 0, 5), finished("ours", ONE, 0, 5)])
 
 

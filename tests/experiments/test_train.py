@@ -152,8 +152,8 @@ def test_bodies_that_cannot_be_placed_are_told_before_anything_is_written(
         ([], 2000, "native", r"seed must differ from evaluation\.curve_seed"),
         ([], -1, "native", "seed must be an integer"),
         ([], 0, "nativ", "did you mean native?"),
-        (["algorithm.random_world_steps=400"], 0, "native", "nothing would be learnt"),
-        (["training.world_steps=10000000000", "algorithm.buffer_world_steps=10000000000"], 0, "native", "GB would be"),
+        (["algorithm.random_world_steps=400"], 0, "native", "or nothing is learnt"),
+        (["training.world_steps=10000000000", "algorithm.buffer_world_steps=10000000000"], 0, "native", "GB of memory"),
     ],
 )
 def test_what_cannot_be_trained_is_told_before_anything_is_written(
@@ -277,7 +277,7 @@ def test_a_stopped_training_goes_on_bit_for_bit(
     whole, _ = train.train(config, 0, engine, tmp_path / "whole")
     with monkeypatch.context() as patch:
         stop_at(patch, vec_step)
-        with pytest.raises(Stopped, match="stopped by SIGTERM; the same command goes on from here"):
+        with pytest.raises(Stopped, match="stopped by SIGTERM; run the same command again to resume"):
             train.train(config, 0, engine, tmp_path / "parts")
     folder = train.run_folder(config, 0, tmp_path / "parts")
     assert (folder / checkpoint.NAME).exists()
@@ -323,7 +323,7 @@ def test_a_signal_during_the_evaluation_costs_the_evaluation_only(
     with monkeypatch.context() as patch:
         patch.setattr(CurriculumVecEnv, "step_wait", counting)
         patch.setattr(module, "play_rounds", stopping)
-        with pytest.raises(Stopped, match="the same command goes on from here"):
+        with pytest.raises(Stopped, match="run the same command again to resume"):
             train.train(tiny(), 0, "native", tmp_path, tensorboard=True)
     folder = train.run_folder(tiny(), 0, tmp_path)
     assert sorted(path.name for path in folder.iterdir() if path.is_file()) == [checkpoint.NAME, "progress.csv"]
