@@ -188,17 +188,26 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _setting(folder: Path) -> Setting:
+    """Return what a folder's name says; another spelling of its numbers would be a second folder of one cell."""
     match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", folder.name)
     if match is None:
         raise files.DamagedFileError(folder, "a setting's folder must be named ratio<lambda>_n<n>_m<m>_<scene>")
-    return Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
+    setting = Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
+    _check_spelling(folder, run_path(Cell("", setting), 0).parent.name)
+    return setting
 
 
 def _seed(folder: Path) -> int:
     match = re.fullmatch(r"seed(\d+)", folder.name)
     if match is None:
         raise files.DamagedFileError(folder, "a run's folder must be named seed<number>")
+    _check_spelling(folder, f"seed{int(match[1])}")
     return int(match[1])
+
+
+def _check_spelling(folder: Path, name: str) -> None:
+    if folder.name != name:
+        raise files.DamagedFileError(folder, f"the folder must be named {name}")
 
 
 def _read_run(folder: Path, cell: Cell, seed: int) -> Run:

@@ -108,6 +108,24 @@ def test_a_folder_of_another_name_is_an_error_that_names_it(tmp_path: Path, name
         records.read_runs(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [
+        ("ours/ratio1.10_n3_m1_random/seed0", "ratio1.1_n3_m1_random"),
+        ("ours/ratio1_n3_m1_random/seed0", "ratio1.0_n3_m1_random"),
+        ("ours/ratio1.1_n03_m1_random/seed0", "ratio1.1_n3_m1_random"),
+        ("ours/ratio1.1_n3_m1_random/seed00", "seed0"),
+    ],
+)
+def test_a_folder_that_spells_its_numbers_otherwise_is_an_error_that_says_how(
+    tmp_path: Path, name: str, right: str
+) -> None:
+    write_run(tmp_path, CELL, 0, (episode(0, 10),))
+    (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(files.DamagedFileError, match=f"the folder must be named {right}$"):
+        records.read_runs(tmp_path)
+
+
 def edit(path: Path, old: str, new: str) -> None:
     text = path.read_text(encoding="utf-8")
     assert old in text

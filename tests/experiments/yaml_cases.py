@@ -172,7 +172,7 @@ ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"reward": ""}, "reward '': neither a known name"),
     ({"algorithm": "madpg"}, "algorithm 'madpg': neither a known name nor a .yaml path; did you mean maddpg?"),
     ({"profile": "ful"}, "training 'ful': neither a known name nor a .yaml path; did you mean full?"),
-    ({"scenario": {"pursuers": float("nan")}}, "scenario.pursuers must be an integer; got nan"),
-    ({"scenario": {"speed_ratio": float("inf")}}, "scenario.speed_ratio must be between 1 and 100; got inf"),
-    ({"scenario": {"obstacle": 1}}, "scenario.obstacle: unknown key; did you mean obstacles?"),
+    ({"fields": {"pursuers": float("nan")}}, "scenario.pursuers must be an integer; got nan"),
+    ({"fields": {"speed_ratio": float("inf")}}, "scenario.speed_ratio must be between 1 and 100; got inf"),
+    ({"fields": {"obstacle": 1}}, "scenario.obstacle: unknown key; did you mean obstacles?"),
 ]  # fmt: skip
