@@ -5,7 +5,7 @@ A term gets its weight, its parameters and its name in the logs from the reward'
 
 import difflib
 import inspect
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -181,7 +181,11 @@ class Reward:
                     raise ValueError(f"terms.{name}.{key:.80}: unknown parameter{nearest(key, known)}")
                 if key == "weight" and value is None:
                     continue
-                if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                if (
+                    isinstance(value, bool)
+                    or not isinstance(value, (int, float))
+                    or not abs(value) <= sys.float_info.max
+                ):
                     raise ValueError(f"terms.{name}.{key} must be a finite number; got {value!r:.80}")
             if "weight" not in settings:
                 raise ValueError(f"terms.{name} needs a weight")

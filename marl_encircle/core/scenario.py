@@ -1,9 +1,12 @@
 """The scenario: everything about the world that the paper leaves open or varies, with default, unit and symbol."""
 
 import math
+import numbers
 import sys
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from marl_encircle.core.dynamics import TARGETS
 from marl_encircle.core.scenes import SCENES
@@ -114,9 +117,12 @@ class Scenario:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
         for f in fields(self):
-            _check(f.name, getattr(self, f.name), hints[f.name], f.metadata)
-            if hints[f.name] is float:  # 1 and 1.0 are one scenario, and one compilation
-                object.__setattr__(self, f.name, float(getattr(self, f.name)))
+            value = getattr(self, f.name)
+            if isinstance(value, np.number):
+                value = value.item()
+            _check(f.name, value, hints[f.name], f.metadata)
+            if hints[f.name] in (int, float):  # 1, 1.0 and NumPy's are one scenario, and one compilation
+                object.__setattr__(self, f.name, hints[f.name](value))
         if self.n_directions % 2:
             raise ValueError(f"n_directions must be even (each direction has its opposite); got {self.n_directions}")
         for name, known in (("scene", SCENES), ("target", TARGETS)):
@@ -127,9 +133,13 @@ class Scenario:
                 f"too many obstacles: {self.pursuers} pursuers and {self.units} obstacles (each disc is one unless "
                 f"composite_unit); at most {MAX_ENTITIES} together can be told apart"
             )
-        if self.cover > MAX_COVER:
+        try:
+            cover = self.cover
+        except OverflowError as error:
+            raise ValueError("the bodies are too large for the scene") from error
+        if cover > MAX_COVER:
             raise ValueError(
-                f"too many bodies to place: obstacles, pursuers and target cover {self.cover:.0%} of the scene; "
+                f"too many bodies to place: obstacles, pursuers and target cover {cover:.0%} of the scene; "
                 f"at most {MAX_COVER:.0%} can be placed at random"
             )
 
@@ -167,8 +177,8 @@ def _check(name: str, value: object, hint: Any, metadata: Any) -> None:
         if value not in get_args(hint):
             raise ValueError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}; got {value!r:.80}")
     elif hint in (int, float):
-        kinds = int if hint is int else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kinds):
+        kind = numbers.Integral if hint is int else numbers.Real
+        if isinstance(value, bool) or not isinstance(value, kind):
             raise ValueError(f"{name} must be {'an integer' if hint is int else 'a number'}; got {value!r:.80}")
         low, high = metadata["low"], metadata["high"]
         if not low <= value <= min(high, sys.float_info.max):

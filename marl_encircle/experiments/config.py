@@ -327,8 +327,6 @@ def _build_scenario(values: Mapping[str, Any]) -> Scenario:
     except ValueError as error:
         about_a_field = str(error).split()[0] in known
         raise ConfigError(f"scenario{'.' if about_a_field else ': '}{error}") from error
-    except OverflowError as error:
-        raise ConfigError("scenario: the bodies are too large for the scene") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:

@@ -52,6 +52,27 @@ def test_a_number_out_of_range_or_of_another_type_names_the_field(name: str) -> 
         assert f"{value!r:.80}" in message
 
 
+@pytest.mark.parametrize("name", [f.name for f in NUMBERS])
+@pytest.mark.parametrize("value", [10**400, -(10**400)])
+def test_a_whole_number_that_no_float_can_hold_is_out_of_range(name: str, value: int) -> None:
+    assert refused(**{name: value}).startswith(f"{name} must be ")
+
+
+def test_numpys_numbers_are_pythons() -> None:
+    given: dict[str, Any] = {
+        "pursuers": np.int64(4),
+        "n_directions": np.uint16(36),
+        "obstacle_radius": np.float32(0.25),
+    }
+    scenario = Scenario(**given, speed_ratio=np.float64(1.5), half_width=np.int8(2))
+    assert scenario == Scenario(pursuers=4, n_directions=36, obstacle_radius=0.25, speed_ratio=1.5, half_width=2.0)
+    for f in NUMBERS:
+        assert type(getattr(scenario, f.name)) is HINTS[f.name]
+    for value in (np.float64(3.0), np.True_, np.array(3)):
+        assert refused(pursuers=value).startswith("pursuers must be an integer; got ")
+    assert refused(pursuers=np.int64(0)).startswith("pursuers must be between 1 and 64; got ")
+
+
 @pytest.mark.parametrize("name", [n for n, hint in HINTS.items() if get_origin(hint) is Literal])
 def test_a_choice_outside_the_list_shows_the_list(name: str) -> None:
     for value in ("nonsense", None, 1, ""):
@@ -93,6 +114,11 @@ def test_too_many_bodies_to_place_are_refused_by_their_cover() -> None:
     assert "cover 51% of the scene; at most 50%" in refused(obstacles=16)
     # Tunnel: ten discs of 0.4 R: 1.6 R^2
     assert Scenario(scene="tunnel").cover == pytest.approx(math.pi * (1.6 * 0.04 + 4 * 0.0025) / 4)
+
+
+@pytest.mark.parametrize("name", ["obstacle_radius", "pursuer_radius", "target_radius"])
+def test_bodies_whose_cover_no_float_can_hold_are_refused(name: str) -> None:
+    assert refused(**{name: 1e200}) == "the bodies are too large for the scene"
 
 
 def test_more_bodies_than_a_byte_can_number_are_refused() -> None:
