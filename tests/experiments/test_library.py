@@ -31,8 +31,8 @@ def test_a_name_is_looked_up_in_every_folder_and_a_path_in_none(tmp_path: Path) 
     folders = [tmp_path / "a", tmp_path / "b"]
     assert [find_file(name, folders, "grid") for name in ("first", "second")] == [Path(first), Path(second)]
     assert find_file("first.yaml", folders, "grid") == Path("first.yaml")
-    with pytest.raises(ConfigError, match=r"grid 'secnd': neither a known name .*did you mean second"):
-        find_file("secnd", folders, "grid")
+    with pytest.raises(ConfigError, match=r"grid 'second2': neither a known name .*did you mean second"):
+        find_file("second2", folders, "grid")
 
 
 def test_a_chain_of_bases_is_followed_from_file_to_file(tmp_path: Path) -> None:
