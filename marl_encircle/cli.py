@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from tqdm import tqdm
 
 from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
@@ -32,6 +33,7 @@ from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.reproduce import reproduce, write_tables
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import train, write_episodes
+from marl_encircle.experiments.verify import verify
 from marl_encircle.experiments.yaml_files import ConfigError
 
 app = typer.Typer(
@@ -245,6 +247,28 @@ def reproduce_tables(
     _exit_if_failed(done.sweep)
 
 
+@app.command("verify-results")
+def verify_results(
+    grid: Annotated[str, typer.Option(help="The grid whose runs are verified.")] = "committed",
+    out: Results = Path("results"),
+    quiet: Quiet = False,
+) -> None:
+    """Play every committed policy's rounds again, render its tables again, and compare. Nothing is written.
+
+    On the processor that a run was made on every round must be equal; elsewhere 99.5 % of the rounds, and every cell's
+    S must lie within its 99 % binomial interval. Exit code 3 where that does not hold.
+    """
+    with tqdm(unit="run", disable=quiet) as bar:
+        found = verify(load_grid(grid), out, lambda done, total: _advance(bar, done, total))
+    check = "every figure of every round" if found.exact else "how the rounds end: another processor than the runs'"
+    typer.echo(f"check: {check}")
+    for name in found.changed:
+        typer.echo(f"changed: {out / name}")
+    typer.echo(f"rounds={found.rounds} equal={found.equal} cells_off={found.cells_off}")
+    if not found.passed:
+        raise typer.Exit(3)
+
+
 @app.command()
 def bench() -> None:
     """Measure the speed rows and write benchmarks/results.json; needs a checkout."""
@@ -358,6 +382,11 @@ class _live:  # noqa: N801 - used like a function
             self.live.update(line, refresh=True)
         else:
             self.console.print(line, soft_wrap=True)
+
+
+def _advance(bar: Any, done: int, total: int) -> None:
+    bar.total = total
+    bar.update(done - bar.n)
 
 
 def _exit_if_failed(progress: Progress) -> None:

@@ -17,8 +17,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from marl_encircle.cli import main
 from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.train import train
 
 TINY = (
@@ -72,6 +74,30 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def everything_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def train_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare a sweep's workers the start of a process."""
+    monkeypatch.setattr(sweeps, "_start", Trained)
+    monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
+
+
+class Trained:
+    """A worker that trains in this process as soon as it is started."""
+
+    def __init__(self, job: Job, out: Path) -> None:
+        train(job.config, job.seed, "native", out)
+
+    def poll(self) -> int:
+        return 0
+
+    def send_signal(self, number: int) -> None:
+        pass
+
+    def wait(self, timeout: float | None = None) -> int:
+        return 0
+
+    kill = wait
 
 
 class Done(NamedTuple):

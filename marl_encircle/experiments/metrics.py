@@ -32,7 +32,6 @@ from marl_encircle.experiments.records import Episode
 
 CONFIDENCE = 0.95
 UNBOUNDED = (-math.inf, math.inf)
-_NORMAL_QUANTILE = float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
 
 Rounds = Mapping["RoundKey", float]
 
@@ -217,15 +216,16 @@ def same_rounds(first: Sequence[Episode], second: Sequence[Episode]) -> bool:
     return {_key(episode) for episode in first} == {_key(episode) for episode in second}
 
 
-def wilson_interval(share: float, rounds: int) -> Interval:
+def wilson_interval(share: float, rounds: int, confidence: float = CONFIDENCE) -> Interval:
     """Wilson's score interval of a share; evaluation noise only.
 
     With z the normal quantile: ((p + z^2/2n) +- z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n).
 
     :param share: successes / rounds, in [0, 1]
     :param rounds: independent rounds behind the share
+    :param confidence: of the two-sided interval
     """
-    z = _NORMAL_QUANTILE
+    z = float(stats.norm.ppf(0.5 + confidence / 2))
     centre = share + z * z / (2 * rounds)
     half = z * math.sqrt(share * (1 - share) / rounds + z * z / (4 * rounds * rounds))
     scale = 1 + z * z / rounds

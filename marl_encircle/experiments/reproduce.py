@@ -60,6 +60,21 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
+    texts = render(grid, results)
+    for name in OTHER_TABLES:
+        if f"tables/{name}" not in texts:
+            (Path(results) / "tables" / name).unlink(missing_ok=True)
+    for name, text in texts.items():
+        files.write_text(Path(results) / name, text)
+    return [Path(results) / name for name in texts]
+
+
+def render(grid: Grid, results: str | Path) -> dict[str, str]:
+    """Return the tables of a grid: path below ``results`` -> text. Nothing is written.
+
+    :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
+    :raises DamagedFileError: if a run there is not what its record says
+    """
     asked = {(job.config.cell, job.seed): job for job in grid.jobs}
     runs = [run for run in read_runs(Path(results) / "runs") if (run.cell, run.seed) in asked]
     for run in runs:
@@ -70,13 +85,7 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
             check_same_run(folder, config, run.seed, read_record(folder).get("engine", "native"))
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS})
     texts |= render_tables(runs, grid.aliases)
-    folder = Path(results) / "tables"
-    for name in OTHER_TABLES:
-        if name not in texts:
-            (folder / name).unlink(missing_ok=True)
-    for name, text in texts.items():
-        files.write_text(folder / name, text)
-    return [folder / name for name in texts]
+    return {f"tables/{name}": text for name, text in texts.items()}
 
 
 def options_of(method: str) -> MethodOptions:

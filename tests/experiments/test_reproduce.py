@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_runs import TINY
+from tiny_runs import TINY, train_in_this_process
 
 from marl_encircle import files
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import reproduce as reproduction
-from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.config import Config, load_config
-from marl_encircle.experiments.grid import Job, load_grid
+from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.records import config_hash
 from marl_encircle.experiments.reproduce import TABLE1_METHODS, Reproduction, options_of, reproduce, write_tables
 from marl_encircle.experiments.tables import MethodOptions, render_table1
@@ -26,24 +25,6 @@ TABLES = [
 ]
 
 
-class Trained:
-    """A worker that trains in this process as soon as it is started."""
-
-    def __init__(self, job: Job, out: Path) -> None:
-        train(job.config, job.seed, "native", out)
-
-    def poll(self) -> int:
-        return 0
-
-    def send_signal(self, number: int) -> None:
-        pass
-
-    def wait(self, timeout: float | None = None) -> int:
-        return 0
-
-    kill = wait
-
-
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make every run of a grid tiny, and train it in this process."""
@@ -52,8 +33,7 @@ def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
         return load_config(*arguments, **{**named, "overrides": TINY})
 
     monkeypatch.setattr(grids, "load_config", tiny)
-    monkeypatch.setattr(sweeps, "_start", Trained)
-    monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
+    train_in_this_process(monkeypatch)
 
 
 def counts(result: Reproduction) -> tuple[int, int, int]:
