@@ -41,117 +41,128 @@ class StackedMLP(nn.Module):
         super().__init__()
         self.n = n
         self._is_relu = activation_fn is nn.ReLU
-        # In place: no gradient needs what was there before
-        self.activation = nn.ReLU(inplace=True) if self._is_relu else activation_fn()
+        self.activation = activation_fn()
         dims = [input_dim, *net_arch]
         layers = list(zip(dims[:-1], net_arch, strict=True))
         self.weights = nn.ParameterList(uniform_parameter(n, i, o, fan_in=i) for i, o in layers)
         self.biases = nn.ParameterList(uniform_parameter(n, 1, o, fan_in=i) for i, o in layers)
-        self._layers: list[tuple[th.Tensor, th.Tensor]] = list(zip(self.weights, self.biases, strict=True))
         n_heads = n if n_heads is None else n_heads
         self.head_weight = uniform_parameter(n_heads, dims[-1], output_dim, fan_in=dims[-1])
         self.head_bias = uniform_parameter(n_heads, 1, output_dim, fan_in=dims[-1])
+        # W_1, b_1, W_2 ...: looking them up in the modules at every call would take longer
+        layer_parameters = chain.from_iterable(zip(self.weights, self.biases, strict=True))
+        self._in_order: list[th.Tensor] = [*layer_parameters, self.head_weight, self.head_bias]
 
     @property
     def dtype(self) -> th.dtype:
         """The weights' precision."""
         return self.head_weight.dtype
 
-    def forward(self, x: th.Tensor, constant: bool = False) -> th.Tensor:
+    def forward(self, x: th.Tensor) -> th.Tensor:
         """Return the outputs of all heads, shape (max(m, n_heads), B, out).
 
         :param x: inputs, shape (m, B, in) with m = n, m = 1 or n = 1
-        :param constant: whether the weights are constants, so that gradients reach the input only
         """
-        layers = self._layers
-        head_weight: th.Tensor = self.head_weight
-        head_bias: th.Tensor = self.head_bias
-        if constant:
-            layers = [(weight.detach(), bias.detach()) for weight, bias in layers]
-            head_weight, head_bias = head_weight.detach(), head_bias.detach()
+        return self._outputs(x, None, None, self._in_order)
 
-        m, batch_size, _ = x.shape
-        hidden = x.reshape(1, m * batch_size, -1) if self.n == 1 else x.expand(self.n, -1, -1)
-        if self._is_relu and layers and th.is_grad_enabled():
-            hidden = ReLULayers.apply(hidden, *chain.from_iterable(layers))  # type: ignore[no-untyped-call]  # torch does not type apply
-        else:
-            for weight, bias in layers:
-                hidden = self.activation(th.baddbmm(bias, hidden, weight))
-        if len(head_weight) > 1:
-            hidden = hidden.reshape(-1, batch_size, hidden.shape[-1])
-        products: th.Tensor = Heads.apply(hidden, head_weight)  # type: ignore[no-untyped-call]  # likewise
-        return (products + head_bias).reshape(-1, batch_size, products.shape[-1])
+    def with_changes(self, x: th.Tensor, changes: th.Tensor, columns: th.Tensor) -> th.Tensor:
+        """Return the outputs where every head reads a few inputs of its own and all others in common.
+
+        x W_1 is made once for all, without a gradient, and only the thin product with ``changes`` is each head's own.
+        The weights are constants: gradients reach ``changes`` only.
+
+        :param x: common inputs, shape (1, B, in)
+        :param changes: what head i adds to its columns of ``x``, shape (n_heads, B, U)
+        :param columns: these columns, shape (n_heads, U)
+        :return: shape (n_heads, B, out)
+        """
+        parameters = [parameter.detach() for parameter in self._in_order]
+        heads = th.arange(columns.shape[0], device=columns.device)[:, None]
+        change_weight = parameters[0].expand(columns.shape[0], -1, -1)[heads, columns]
+        return self._outputs(x, changes, change_weight, parameters)
+
+    def _outputs(
+        self, x: th.Tensor, changes: th.Tensor | None, change_weight: th.Tensor | None, parameters: list[th.Tensor]
+    ) -> th.Tensor:
+        if self._is_relu and len(parameters) > 2:
+            outputs: th.Tensor = ReLUMLP.apply(x, changes, change_weight, *parameters)  # type: ignore[no-untyped-call]  # torch does not type apply
+            return outputs
+        weight, bias, *above = parameters
+        sums = x @ weight + bias
+        if changes is not None and change_weight is not None:
+            sums = sums + changes @ change_weight
+        for weight, bias in zip(above[::2], above[1::2], strict=True):
+            sums = self.activation(sums) @ weight + bias
+        return sums
 
 
-class ReLULayers(th.autograd.Function):
-    """ReLU(... ReLU(x W_1 + b_1) ... W_L + b_L), as autograd has it but in less memory, which is what takes the time.
+class ReLUMLP(th.autograd.Function):
+    """ReLU(... ReLU(x W_1 + dx W_dx + b_1) ...) W_L + b_L, as autograd has it but in fewer steps and less memory.
 
-    The gradient is masked in the array in which it comes: ``Heads`` makes that for this function alone.
+    All leading axes broadcast.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, *layers: th.Tensor) -> th.Tensor:
-        """Return the last layer's activations, shape (n, B, H).
+    def forward(
+        ctx: Any, x: th.Tensor, dx: th.Tensor | None, dx_weight: th.Tensor | None, *parameters: th.Tensor
+    ) -> th.Tensor:
+        """Return the last layer's outputs, shape (N, B, out).
 
-        :param x: inputs, shape (n, B, in)
-        :param layers: W_1, b_1, W_2, b_2 ...; weights (n, in, out), biases (n, 1, out)
+        :param x: inputs, shape (m, B, in)
+        :param dx: further inputs of the first layer, shape (N, B, U)
+        :param dx_weight: their weights, shape (N, U, H)
+        :param parameters: W_1, b_1, W_2 ... b_L; weights (n, in, out), biases (n, 1, out)
         """
+        *layers, head_weight, head_bias = parameters
         activations = [x]
         for weight, bias in zip(layers[::2], layers[1::2], strict=True):
-            activations.append(th.baddbmm(bias, activations[-1], weight).relu_())
-        ctx.save_for_backward(*activations, *layers[::2])
-        return activations[-1]
+            sums = (activations[-1] @ weight).add_(bias)
+            if dx is not None and dx_weight is not None and len(activations) == 1:
+                sums = (dx @ dx_weight).add_(sums)
+            activations.append(sums.relu_())
+        hidden = activations[-1]
+        # The head is thin: as rows it is the left factor of a product that is fast, and heads of one trunk are one
+        rows = head_weight.mT.reshape(min(hidden.shape[0], head_weight.shape[0]), -1, hidden.shape[2])
+        ctx.save_for_backward(dx_weight, rows, *layers[::2], *activations)
+        ctx.head_shape = head_weight.mT.shape
+        # A product with one row is sent to a slower kernel than one with two
+        padded = rows.expand(-1, 2, -1).contiguous() if rows.shape[1] == 1 else rows
+        outputs = (padded @ hidden.mT)[:, : rows.shape[1]]
+        return outputs.reshape(-1, head_weight.shape[2], hidden.shape[1]).mT + head_bias
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        """Return the gradients of ``x``, W_1, b_1, W_2 ..."""
-        n_layers = len(ctx.saved_tensors) // 2
-        activations, weights = ctx.saved_tensors[: n_layers + 1], ctx.saved_tensors[n_layers + 1 :]
-        grad_layers: list[th.Tensor | None] = []
-        (grad,) = grads
-        for layer in range(n_layers, 0, -1):
-            th.ops.aten.threshold_backward.grad_input(grad, activations[layer], 0, grad_input=grad)
-            below = activations[layer - 1]
-            if ctx.needs_input_grad[2 * layer - 1]:
-                grad_layers = [below.mT.bmm(grad), grad.sum(1, keepdim=True), *grad_layers]
-            else:
-                grad_layers = [None, None, *grad_layers]
-            if layer == 1 and not ctx.needs_input_grad[0]:
-                return None, *grad_layers
-            grad = grad.bmm(weights[layer - 1].mT)
-        return grad, *grad_layers
+        """Return the gradients of ``x``, ``dx`` and all parameters; ``dx_weight`` has none."""
+        dx_weight, rows, *saved = ctx.saved_tensors
+        n_layers = len(saved) // 2
+        weights, activations = saved[:n_layers], saved[n_layers:]
+        needs_x, needs_dx, _, *_, needs_parameters = ctx.needs_input_grad
+        grad_parameters: list[th.Tensor | None] = [None] * (2 * n_layers + 2)
 
-
-class Heads(th.autograd.Function):
-    """Thin last layers: products whose result is a few columns wide, in the order of operands that is fast for them."""
-
-    @staticmethod
-    def forward(ctx: Any, hidden: th.Tensor, weight: th.Tensor) -> th.Tensor:
-        """Return ``hidden @ weight``, shape (N, B, out).
-
-        :param hidden: shape (N, B, H), or (1, B, H) for all heads
-        :param weight: shape (N, H, out)
-        """
-        rows = weight.mT.contiguous()
-        ctx.save_for_backward(hidden, rows)
-        if len(hidden) < len(rows):
-            return hidden[0].mm(rows.flatten(0, 1).T).view(hidden.shape[1], *rows.shape[:2]).transpose(0, 1)
-        # A product with one row is sent to a slower kernel than one with two
-        padded = rows.expand(-1, 2, -1).contiguous() if rows.shape[1] == 1 else rows
-        return padded.bmm(hidden.mT)[:, : rows.shape[1]].mT
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
-        """Return the gradients of ``hidden`` and ``weight``."""
-        hidden, rows = ctx.saved_tensors
-        (grad,) = grads
-        shape = rows.shape
-        if len(hidden) < len(rows):
-            grad, rows = grad.transpose(0, 1).reshape(1, hidden.shape[1], -1), rows.flatten(0, 1)[None]
-        grad_weight = grad.mT.bmm(hidden).view(shape).mT if ctx.needs_input_grad[1] else None
-        return grad.bmm(rows), grad_weight
+        hidden, (grad,) = activations[-1], grads
+        grad_rows = grad.mT.reshape(hidden.shape[0], -1, grad.shape[1])
+        if needs_parameters:
+            grad_head = (grad_rows @ hidden).sum_to_size(rows.shape).view(ctx.head_shape).mT
+            grad_bias = grad.sum(1, keepdim=True).sum_to_size(ctx.head_shape[0], 1, ctx.head_shape[1])
+            grad_parameters[-2:] = grad_head, grad_bias
+        grad = grad_rows.mT @ rows
+        for layer in reversed(range(n_layers)):
+            weight, below, above = weights[layer], activations[layer], activations[layer + 1]
+            # In place: nobody else has this array
+            th.ops.aten.threshold_backward.grad_input(grad, above, 0, grad_input=grad)
+            if needs_parameters:
+                n, _, size = weight.shape
+                grad_weight, grad_bias = below.mT @ grad, grad.sum(1, keepdim=True)
+                grad_parameters[2 * layer : 2 * layer + 2] = (
+                    grad_weight.sum_to_size(weight.shape),
+                    grad_bias.sum_to_size(n, 1, size),
+                )
+            if layer > 0:
+                grad = grad @ weight.mT
+        grad_x = (grad @ weights[0].mT).sum_to_size(activations[0].shape) if needs_x else None
+        grad_dx = (dx_weight @ grad.mT).mT if needs_dx else None
+        return grad_x, grad_dx, None, *grad_parameters
 
 
 class AgentFeatures(BaseFeaturesExtractor):

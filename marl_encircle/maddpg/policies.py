@@ -160,10 +160,10 @@ class CentralCritic(AgentModel):
         self.q_networks = nn.ModuleList(
             StackedMLP(n_networks, input_dim, net_arch, 1, activation_fn, n_heads=n_agents) for _ in range(n_critics)
         )
-        # (N, 1, N * U), row i is true at the action of agent i
-        self.own_action: th.Tensor
-        own_action = th.eye(n_agents, dtype=th.bool).repeat_interleave(get_action_dim(action_space), dim=1)
-        self.register_buffer("own_action", own_action[:, None], persistent=False)
+        # (N, U), row i: the inputs of the networks that are the action of agent i
+        self.own_columns: th.Tensor
+        own_columns = th.arange(n_agents * features_dim, input_dim).view(n_agents, -1)
+        self.register_buffer("own_columns", own_columns, persistent=False)
 
     @property
     def dtype(self) -> th.dtype:
@@ -176,9 +176,8 @@ class CentralCritic(AgentModel):
         :param obs: observations, shape (B, N, *O)
         :param actions: actions in [-1, 1], shape (B, N, U)
         """
-        features = self.agent_features(obs, self.dtype).flatten(1)
-        x = th.cat([features, actions.flatten(1).to(self.dtype)], dim=-1)
-        return th.stack([q_network(x[None]).squeeze(-1) for q_network in self.q_networks])
+        x = self._inputs(obs, actions)
+        return th.stack([q_network(x).squeeze(-1) for q_network in self.q_networks])
 
     def own_action_values(self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor) -> th.Tensor:
         """First estimate of Q_i(s, a_1 .. a_i = mu_i(o_i) .. a_N) of every agent i, shape (N, B).
@@ -187,10 +186,14 @@ class CentralCritic(AgentModel):
         :param actions: actions in [-1, 1] that the other agents keep, shape (B, N, U)
         :param own_actions: the action that agent i takes where Q_i is asked, shape (B, N, U)
         """
-        features = self.agent_features(obs, self.dtype).flatten(1).expand(len(self.own_action), -1, -1)
-        joint_actions = th.where(self.own_action, own_actions.flatten(1), actions.flatten(1))
-        q_values: th.Tensor = self.q_networks[0](th.cat([features, joint_actions], dim=-1), constant=True)
-        return q_values.squeeze(-1)
+        changes = (own_actions - actions).to(self.dtype).transpose(0, 1)
+        network: StackedMLP = self.q_networks[0]  # type: ignore[assignment]  # a ModuleList forgets
+        return network.with_changes(self._inputs(obs, actions), changes, self.own_columns).squeeze(-1)
+
+    def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return what all networks read, joint observation and joint action, shape (1, B, N * (features + U))."""
+        features = self.agent_features(obs, self.dtype).flatten(1)
+        return th.cat([features, actions.flatten(1).to(self.dtype)], dim=-1)[None]
 
 
 class MADDPGPolicy(BasePolicy):

@@ -58,12 +58,27 @@ def test_other_activations_are_left_to_autograd() -> None:
     th.testing.assert_close(network(x), by_hand)
 
 
-def test_constant_networks_pass_gradients_to_the_input_only() -> None:
-    network = StackedMLP(2, 5, [4, 4], 1)
-    x = th.randn(2, 7, 5, requires_grad=True)
-    network(x, constant=True).sum().backward()
-    assert x.grad is not None
-    assert x.grad.abs().sum() > 0
+@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.Tanh])
+@pytest.mark.parametrize("net_arch", [[], [4], [4, 6]], ids=str)
+@pytest.mark.parametrize("n", [1, 3])
+def test_changes_equal_other_inputs_and_get_all_of_the_gradient(
+    n: int, net_arch: list[int], activation_fn: type[nn.Module]
+) -> None:
+    th.manual_seed(0)
+    network = StackedMLP(n, 8, net_arch, 1, activation_fn, n_heads=3).double()
+    x = th.randn(1, 7, 8, dtype=th.float64)
+    changes = th.randn(3, 7, 2, dtype=th.float64, requires_grad=True)
+    # Head i reads two columns of its own; the first two are common
+    columns = th.tensor([[2, 3], [4, 5], [6, 7]])
+    inputs = x.repeat(3, 1, 1)
+    for head, (first, second) in enumerate(columns.tolist()):
+        inputs[head, :, [first, second]] += changes[head]
+
+    outputs, expected = network.with_changes(x, changes, columns), network(inputs)
+    th.testing.assert_close(outputs, expected, rtol=1e-12, atol=1e-12)
+    (expected_grad,) = th.autograd.grad(expected.square().sum(), changes)
+    outputs.square().sum().backward()
+    th.testing.assert_close(changes.grad, expected_grad, rtol=1e-12, atol=1e-12)
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
