@@ -69,7 +69,7 @@ def facing_arc(offset: Array, speed_ratio: float) -> tuple[Array, Array]:
     :return: angles [rad] and distances from the target [scene units], (181,) each
     """
     widest = math.asin(1 / speed_ratio)
-    phi = np.linspace(-widest, widest, 181)
+    phi = widest * np.sin(np.linspace(-np.pi / 2, np.pi / 2, 181))  # closest where the arc leaves along the tangent
     root = np.sqrt(np.maximum(1 - (speed_ratio * np.sin(phi)) ** 2, 0.0))
     distance = speed_ratio * float(np.hypot(*offset)) / (speed_ratio * np.cos(phi) + root)
     return phi + math.atan2(offset[1], offset[0]), distance
