@@ -16,10 +16,10 @@ from marl_encircle.experiments.figures.curves import ALL_METHODS, Band, band_of,
 from marl_encircle.experiments.figures.rounds import METHOD, PLACES, Column, Place, choose_round, draw_figure6
 from marl_encircle.experiments.figures.situations import draw_figure1, draw_figure3
 from marl_encircle.experiments.grid import Grid
+from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
-from marl_encircle.experiments.records import MAX_FILE, Cell, Run, read_record, read_runs, run_path
+from marl_encircle.experiments.records import MAX_FILE, Cell, Run, read_record, run_path
 from marl_encircle.experiments.replay import record_round
-from marl_encircle.experiments.train import check_same_run
 
 
 def write_figures(grid: Grid, results: str | Path) -> list[Path]:
@@ -59,23 +59,6 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     }
 
 
-def runs_of(grid: Grid, folder: Path) -> list[Run]:
-    """Return the runs of a grid that there are, each one with the configuration that the grid asks for.
-
-    :param folder: of all runs
-    :raises OtherRunError: if a run has another configuration, with the difference
-    :raises DamagedFileError: if a run is not what its record says
-    """
-    asked = {(job.config.cell, job.seed): job.config for job in grid.jobs}
-    runs = [run for run in read_runs(folder) if (run.cell, run.seed) in asked]
-    for run in runs:
-        if run.status != "unfinished":
-            path = folder / run_path(run.cell, run.seed)
-            # Both engines train the same policy, so that a run of either will do.
-            check_same_run(path, asked[run.cell, run.seed], run.seed, read_record(path).get("engine", "native"))
-    return runs
-
-
 def _bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
     """Read the learning curves of the finished runs in Figure 4's settings."""
     by_cell: dict[Cell, list[curves.Curve]] = {}
@@ -99,11 +82,10 @@ def _bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
 def _summaries(runs: Sequence[Run]) -> Mapping[Cell, CellSummary]:
     """Summarise the finished runs of Figure 5's cells under each method's own rule."""
     summaries = {}
-    for cell in {run.cell for run in runs}:
-        found = [run for run in runs if run.cell == cell and run.status == "finished" and run.closure]
-        if found and cell.method in contributions.METHODS and cell.setting in contributions.SETTINGS:
-            closure = found[0].closure
-            assert closure is not None
+    for cell in (Cell(method, setting) for method in contributions.METHODS for setting in contributions.SETTINGS):
+        found = [run for run in runs if run.cell == cell and run.status == "finished"]
+        closure = found[0].closure if found else None
+        if closure is not None:
             summaries[cell] = summarise_cell({run.seed: run.episodes for run in found}, closure)
     return summaries
 

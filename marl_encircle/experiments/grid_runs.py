@@ -1,0 +1,25 @@
+"""The runs of a grid that there are, each one what the grid asks for."""
+
+from pathlib import Path
+
+from marl_encircle.experiments.grid import Grid
+from marl_encircle.experiments.records import Run, read_record, read_runs
+from marl_encircle.experiments.train import check_same_run, run_folder
+
+
+def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
+    """Return the runs of a grid in the order of method, setting, seed; other runs in the folder are left out.
+
+    :param folder: of all runs
+    :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
+    :raises DamagedFileError: if a run is not what its record says
+    """
+    asked = {(job.config.cell, job.seed): job.config for job in grid.jobs}
+    runs = [run for run in read_runs(folder) if (run.cell, run.seed) in asked]
+    for run in runs:
+        if run.status != "unfinished":
+            config = asked[run.cell, run.seed]
+            path = run_folder(config, run.seed, folder)
+            # Both engines train the same policy, so that a run of either will do.
+            check_same_run(path, config, run.seed, read_record(path).get("engine", "native"))
+    return runs
