@@ -25,9 +25,9 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.utils import FloatSchedule, should_collect_more_steps
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from torch import nn
-from torch.nn import functional
 
 from marl_encircle.maddpg.buffers import JointReplayBuffer
+from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients
 from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
@@ -229,21 +229,17 @@ class MADDPG(OffPolicyAlgorithm):
                 target_q_values = batch.rewards.T + (1 - batch.dones.T) * self.gamma * next_q_values
 
             # Critics: minimise the mean of (y_i - Q_i(s, a_1 .. a_n))^2, Eq. 3
-            q_values = self.critic(batch.observations, batch.actions)
-            critic_loss = (
-                functional.mse_loss(q_values, target_q_values.expand_as(q_values), reduction="sum") / batch_size
-            )
-            self._optimize(self.critic, critic_loss)
-            critic_losses.append(critic_loss.detach())
+            critic_losses.append(critic_gradients(self.critic, batch.observations, batch.actions, target_q_values))
+            self._step(self.critic)
 
             if self._n_updates % self.policy_delay == 0:
                 # Actors: ascend the mean of Q_i(s, a_1 .. mu_i(o_i) .. a_n), Eq. 2
-                logits = self.actor.logits(batch.observations)
-                q_values = self.critic.own_action_values(batch.observations, batch.actions, th.tanh(logits))
-                actor_loss = -q_values.sum() / batch_size
-                penalty = self.actor_regularization * logits.square().mean(dim=(0, 2)).sum()
-                self._optimize(self.actor, actor_loss + penalty)
-                actor_losses.append(actor_loss.detach())
+                actor_losses.append(
+                    actor_gradients(
+                        self.actor, self.critic, batch.observations, batch.actions, self.actor_regularization
+                    )
+                )
+                self._step(self.actor)
 
                 # Targets follow slowly
                 self.policy.update_targets(self.tau)
@@ -258,13 +254,10 @@ class MADDPG(OffPolicyAlgorithm):
         actions: th.Tensor = self.actor_target(batch.next_observations)
         return actions
 
-    def _optimize(self, network: Actor | CentralCritic, loss: th.Tensor) -> None:
-        """One gradient step on the parameters of ``network`` alone."""
-        parameters = network.optimizer.param_groups[0]["params"]
-        for parameter, grad in zip(parameters, th.autograd.grad(loss, parameters), strict=True):
-            parameter.grad = grad
+    def _step(self, network: Actor | CentralCritic) -> None:
+        """One step of the optimizer along the gradients that are set."""
         if self.max_grad_norm is not None:
-            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            nn.utils.clip_grad_norm_(network.optimizer.param_groups[0]["params"], self.max_grad_norm)
         network.optimizer.step()
 
     def learn(

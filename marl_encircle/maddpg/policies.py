@@ -4,7 +4,7 @@ Shape legend: B minibatch, N agents, O observation size, U action size.
 """
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch as th
@@ -29,6 +29,11 @@ class AgentModel(BaseModel):
     """What actor and critic have in common: features of every agent's observation, in the model's own precision."""
 
     features_extractor: BaseFeaturesExtractor
+
+    @property
+    def only_flattens(self) -> bool:
+        """Whether the features are the observation itself, so that there is nothing to learn below the networks."""
+        return cast(AgentFeatures, self.features_extractor).only_flattens
 
     def agent_features(self, obs: th.Tensor, dtype: th.dtype) -> th.Tensor:
         """Features of the joint observation.
@@ -94,13 +99,25 @@ class Actor(AgentModel, BasePolicy):
             "share_parameters": self.share_parameters,
         }
 
+    @property
+    def has_backward(self) -> bool:
+        """Whether gradients can do without autograd, see ``StackedMLP.backward``."""
+        return self.mu.has_backward and self.only_flattens
+
     def logits(self, obs: th.Tensor) -> th.Tensor:
         """Actions before squashing, shape (B, N, U).
 
         :param obs: observations, shape (B, N, *O)
         """
-        logits: th.Tensor = self.mu(self.agent_features(obs, self.mu.dtype).transpose(0, 1))
+        logits: th.Tensor = self.mu(self.inputs(obs))
         return logits.transpose(0, 1)
+
+    def inputs(self, obs: th.Tensor) -> th.Tensor:
+        """Return what the networks read, the features of each agent's own observation, shape (N, B, features).
+
+        :param obs: observations, shape (B, N, *O)
+        """
+        return self.agent_features(obs, self.mu.dtype).transpose(0, 1)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """Actions in [-1, 1], shape (B, N, U).
@@ -166,9 +183,19 @@ class CentralCritic(AgentModel):
         self.register_buffer("own_columns", own_columns, persistent=False)
 
     @property
+    def networks(self) -> list[StackedMLP]:
+        """The independent estimates' networks."""
+        return list(self.q_networks)  # type: ignore[arg-type]  # a ModuleList forgets what it holds
+
+    @property
+    def has_backward(self) -> bool:
+        """Whether gradients can do without autograd, see ``StackedMLP.backward``."""
+        return self.networks[0].has_backward and self.only_flattens
+
+    @property
     def dtype(self) -> th.dtype:
         """The networks' precision."""
-        return next(self.q_networks.parameters()).dtype
+        return self.networks[0].dtype
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Estimates of Q_i(s, a_1 ... a_N) of every agent i, shape (n_critics, N, B).
@@ -176,8 +203,8 @@ class CentralCritic(AgentModel):
         :param obs: observations, shape (B, N, *O)
         :param actions: actions in [-1, 1], shape (B, N, U)
         """
-        x = self._inputs(obs, actions)
-        return th.stack([q_network(x).squeeze(-1) for q_network in self.q_networks])
+        x = self.inputs(obs, actions)
+        return th.stack([network(x).squeeze(-1) for network in self.networks])
 
     def own_action_values(self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor) -> th.Tensor:
         """First estimate of Q_i(s, a_1 .. a_i = mu_i(o_i) .. a_N) of every agent i, shape (N, B).
@@ -186,14 +213,30 @@ class CentralCritic(AgentModel):
         :param actions: actions in [-1, 1] that the other agents keep, shape (B, N, U)
         :param own_actions: the action that agent i takes where Q_i is asked, shape (B, N, U)
         """
-        changes = (own_actions - actions).to(self.dtype).transpose(0, 1)
-        network: StackedMLP = self.q_networks[0]  # type: ignore[assignment]  # a ModuleList forgets
-        return network.with_changes(self._inputs(obs, actions), changes, self.own_columns).squeeze(-1)
+        activations = self._own_action_activations(obs, actions, own_actions)
+        return self.networks[0].outputs(activations).squeeze(-1)
 
-    def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def own_action_gradients(
+        self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Return ``own_action_values`` and the gradient of each Q_i with respect to a_i, shapes (N, B) and (N, B, U).
+
+        The parameters are constants; ``has_backward`` only.
+        """
+        network = self.networks[0]
+        activations = self._own_action_activations(obs, actions, own_actions)
+        q_values = network.outputs(activations)
+        grad = network.backward(activations, th.ones_like(q_values), constant=True)
+        return q_values.squeeze(-1), (network.first_weight(self.own_columns) @ grad.mT).mT
+
+    def inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return what all networks read, joint observation and joint action, shape (1, B, N * (features + U))."""
         features = self.agent_features(obs, self.dtype).flatten(1)
         return th.cat([features, actions.flatten(1).to(self.dtype)], dim=-1)[None]
+
+    def _own_action_activations(self, obs: th.Tensor, actions: th.Tensor, own_actions: th.Tensor) -> list[th.Tensor]:
+        changes = (own_actions - actions).to(self.dtype).transpose(0, 1)
+        return self.networks[0].activations(self.inputs(obs, actions), changes, self.own_columns)
 
 
 class MADDPGPolicy(BasePolicy):

@@ -50,8 +50,36 @@ def test_stacked_networks_equal_single_ones_in_values_and_gradients(
     th.testing.assert_close(grads, expected_grads, rtol=1e-12, atol=1e-12)
 
 
-def test_other_activations_are_left_to_autograd() -> None:
+@pytest.mark.parametrize("output_dim", [1, 2])
+@pytest.mark.parametrize("net_arch", [[4], [4, 6]], ids=str)
+@pytest.mark.parametrize("case", CASES)
+def test_gradients_by_hand_equal_those_of_autograd(case: str, net_arch: list[int], output_dim: int) -> None:
+    n, n_heads, m = CASES[case]
+    th.manual_seed(0)
+    network = StackedMLP(n, 5, net_arch, output_dim, n_heads=n_heads).double()
+    assert network.has_backward
+    x = th.randn(m, 7, 5, dtype=th.float64)
+    weights = th.randn(max(m, n_heads), 7, output_dim, dtype=th.float64)
+    parameters = list(network.parameters())
+    expected = th.autograd.grad((network(x) * weights).sum(), parameters)
+    with th.no_grad():
+        grad = network.backward(network.activations(x), weights)
+        th.testing.assert_close([parameter.grad for parameter in parameters], list(expected), rtol=1e-12, atol=1e-12)
+        # The first bias is added to the sums, so that its gradient is theirs, summed up
+        th.testing.assert_close(grad.sum(1, keepdim=True).sum_to_size(network.biases[0].shape), network.biases[0].grad)
+
+
+def test_constant_parameters_get_no_gradients() -> None:
+    network = StackedMLP(3, 5, [4], 1)
+    with th.no_grad():
+        network.backward(network.activations(th.randn(3, 7, 5)), th.ones(3, 7, 1), constant=True)
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+def test_other_networks_are_left_to_autograd() -> None:
     network = StackedMLP(2, 5, [4], 1, nn.Tanh).double()
+    assert not network.has_backward
+    assert not StackedMLP(2, 5, [], 1).has_backward
     x = th.randn(2, 7, 5, dtype=th.float64, requires_grad=True)
     assert th.autograd.gradcheck(network, x)
     by_hand = th.tanh(x @ network.weights[0] + network.biases[0]) @ network.head_weight + network.head_bias
@@ -61,9 +89,7 @@ def test_other_activations_are_left_to_autograd() -> None:
 @pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.Tanh])
 @pytest.mark.parametrize("net_arch", [[], [4], [4, 6]], ids=str)
 @pytest.mark.parametrize("n", [1, 3])
-def test_changes_equal_other_inputs_and_get_all_of_the_gradient(
-    n: int, net_arch: list[int], activation_fn: type[nn.Module]
-) -> None:
+def test_changes_equal_other_inputs(n: int, net_arch: list[int], activation_fn: type[nn.Module]) -> None:
     th.manual_seed(0)
     network = StackedMLP(n, 8, net_arch, 1, activation_fn, n_heads=3).double()
     x = th.randn(1, 7, 8, dtype=th.float64)
@@ -74,12 +100,11 @@ def test_changes_equal_other_inputs_and_get_all_of_the_gradient(
     for head, (first, second) in enumerate(columns.tolist()):
         inputs[head, :, [first, second]] += changes[head]
 
-    outputs, expected = network.with_changes(x, changes, columns), network(inputs)
+    outputs, expected = network.outputs(network.activations(x, changes, columns)), network(inputs)
     th.testing.assert_close(outputs, expected, rtol=1e-12, atol=1e-12)
     (expected_grad,) = th.autograd.grad(expected.square().sum(), changes)
-    outputs.square().sum().backward()
-    th.testing.assert_close(changes.grad, expected_grad, rtol=1e-12, atol=1e-12)
-    assert all(parameter.grad is None for parameter in network.parameters())
+    (grad,) = th.autograd.grad(outputs.square().sum(), changes)
+    th.testing.assert_close(grad, expected_grad, rtol=1e-12, atol=1e-12)
 
 
 def test_weights_start_like_those_of_linear_layers() -> None:
