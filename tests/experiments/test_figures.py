@@ -19,6 +19,7 @@ import torch as th
 from made_up import episode, rounds
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Arc
 from tiny_runs import TINY, finished
 
 from marl_encircle import files
@@ -177,6 +178,10 @@ def test_figure_3_draws_tangents_that_touch_the_circle() -> None:
     for line in dashed:
         (x, y), (cx, cy) = np.array(line.get_xydata())[1], centre
         assert abs(x * cy - y * cx) / math.hypot(x, y) == pytest.approx(radius)
+    widths = [patch.theta2 - patch.theta1 for patch in figure.axes[0].patches if isinstance(patch, Arc)]
+    # 2 arcsin(1 / 1.3) = 100.57 degrees occupied, of which the neighbours take some.
+    assert max(widths) == pytest.approx(100.57, abs=0.01)
+    assert 45 < min(widths) < 90
     assert r"$\alpha_1$" in words(figure)
 
 
