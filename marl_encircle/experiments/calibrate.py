@@ -25,9 +25,10 @@ from marl_encircle.experiments.config import Profile, Section, check_seed, expla
 from marl_encircle.experiments.grid import Job, SettingConfig
 from marl_encircle.experiments.library import PACKAGE, find_file
 from marl_encircle.experiments.metrics import summarise_cell
+from marl_encircle.experiments.paper import paper_results
 from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
-from marl_encircle.experiments.tables import markdown, paper_results
+from marl_encircle.experiments.typeset import markdown
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 MAX_SCENARIOS = 16

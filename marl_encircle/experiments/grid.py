@@ -45,10 +45,14 @@ class Shared(Section):
 
 
 class GridConfig(Section):
-    """A grid file."""
+    """A grid file.
+
+    :param frozen: the commit in which scenario and recipe were frozen, 40 hexadecimal digits; the tables name it
+    """
 
     profile: Profile
     scenario: str = "default"
+    frozen: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
     groups: list[Group]
     shared: list[Shared]
 
@@ -84,10 +88,16 @@ def _config(job: Job) -> Config:
 
 
 class Grid(NamedTuple):
-    """The runs of a grid and the cells that share another's runs."""
+    """The runs of a grid, the cells that share another's runs, and the commit in which its recipe was frozen."""
 
     jobs: tuple[Job, ...]
     aliases: dict[Cell, Cell]
+    frozen: str | None = None
+
+    @property
+    def cells(self) -> set[Cell]:
+        """Cells that have or share runs."""
+        return {job.config.cell for job in self.jobs} | self.aliases.keys()
 
 
 def load_grid(name: str) -> Grid:
@@ -132,7 +142,7 @@ def load_grid(name: str) -> Grid:
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
-    return Grid(tuple(jobs), aliases)
+    return Grid(tuple(jobs), aliases, grid.frozen)
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

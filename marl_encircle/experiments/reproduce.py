@@ -9,10 +9,10 @@ from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid, load_grid
-from marl_encircle.experiments.records import read_record, read_runs
+from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.tables import OTHER_TABLES, MethodOptions, render_table1, render_tables
-from marl_encircle.experiments.train import check_same_run, run_folder, write_episodes
+from marl_encircle.experiments.train import run_folder, write_episodes
 
 TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
 
@@ -75,16 +75,9 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
-    asked = {(job.config.cell, job.seed): job for job in grid.jobs}
-    runs = [run for run in read_runs(Path(results) / "runs") if (run.cell, run.seed) in asked]
-    for run in runs:
-        if run.status != "unfinished":
-            config = asked[run.cell, run.seed].config
-            folder = run_folder(config, run.seed, Path(results) / "runs")
-            # Both engines train the same policy, so that a run of either will do.
-            check_same_run(folder, config, run.seed, read_record(folder).get("engine", "native"))
-    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS})
-    texts |= render_tables(runs, grid.aliases)
+    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
+    runs = runs_of(grid, Path(results) / "runs")
+    texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
     return {f"tables/{name}": text for name, text in texts.items()}
 
 

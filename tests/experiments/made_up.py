@@ -1,4 +1,4 @@
-"""Made-up evaluation rounds and run folders, written through the package's own writer."""
+"""Made-up evaluation rounds, runs and run folders, written through the package's own writer, and tables read back."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from marl_encircle import files
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments import records
-from marl_encircle.experiments.records import Cell, Closure, Episode, config_hash
+from marl_encircle.experiments.records import Cell, Closure, Episode, Run, Setting, config_hash
 
 SEEDS = world_seeds(1000, 1000)
 """Of the rounds of evaluation seed 1000."""
@@ -23,6 +23,23 @@ def rounds(successes: int, total: int, step: int = 20, offset: int = 0) -> list[
     """A run with so many successes under both rules; ``offset`` makes its rounds other ones."""
     steps = [step if number < successes else None for number in range(total)]
     return [episode(offset + number, at, at) for number, at in enumerate(steps)]
+
+
+def finished(method: str, setting: Setting, seed: int, successes: int, step: int = 20, closure: Closure = "all") -> Run:
+    """A finished run of 100 rounds."""
+    return Run(Cell(method, setting), seed, "finished", closure, rounds(successes, 100, step))
+
+
+def markdown_rows(text: str) -> list[list[str]]:
+    """Cells of the rows of a Markdown table, without its head."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def markdown_row(text: str, *start: str) -> list[str]:
+    """The only row that starts with these cells, without them."""
+    [row] = [row for row in markdown_rows(text) if row[: len(start)] == list(start)]
+    return row[len(start) :]
 
 
 def write_run(

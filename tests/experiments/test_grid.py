@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from marl_encircle import cli
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.grid import Grid, Job, arguments, load_grid
+from marl_encircle.experiments.paper import paper_results
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.tables import paper_results
 from marl_encircle.experiments.yaml_files import ConfigError
 
 ONE = Setting(1.1, 3, 1)
@@ -66,6 +66,20 @@ def test_a_run_that_is_asked_for_twice_is_one_run(tmp_path: Path) -> None:
     assert [(job.reward, job.seed) for job in grid.jobs] == [("ours", 2), ("ours", 3)]
 
 
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def test_a_grid_may_name_the_commit_in_which_its_recipe_was_frozen(tmp_path: Path) -> None:
+    assert grid_of(tmp_path, GRID.format(method="ours")).frozen is None
+    assert grid_of(tmp_path, f"frozen: {COMMIT}\n" + GRID.format(method="ours")).frozen == COMMIT
+
+
+def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
+    grid = load_grid("committed")
+    assert len(grid.cells) == 9
+    assert Cell("model_a", Setting(1.1, 3, 0)) in grid.cells
+
+
 def test_a_users_method_is_given_by_path_from_the_grids_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "idea.yaml").write_text("base: ours\nscale: 0.1\n")
@@ -109,6 +123,10 @@ SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
         ("[2, 3, 2]", "[true]", "groups.0.seeds.0: input should be a valid integer; got True"),
         ("[2, 3, 2]", "3", "groups.0.seeds: input should be a valid list; got 3"),
         ("[ours, ours]", "[ours, our]", "reward 'our': neither a known name nor a .yaml path; did you mean ours?"),
+        ("shared: []", f"shared: []\nfrozen: {COMMIT[1:]}", "frozen: string should match pattern"),
+        ("shared: []", f"shared: []\nfrozen: {COMMIT.upper()}", "frozen: string should match pattern"),
+        ("shared: []", f"shared: []\nfrozen: {COMMIT}0", "frozen: string should match pattern"),
+        ("shared: []", f"shared: []\nfrozen: {'1' * 40}", "frozen: input should be a valid string; got 111"),
         ("shared: []", "shared: [{method: a, run_of: ours, obstacles: 0}]", "unknown key; did you mean runs_of?"),
         ("shared: []", "shared: [{method: ours, runs_of: model_a, obstacles: 1}]", "which is not in the grid"),
     ],

@@ -18,11 +18,10 @@ from marl_encircle.experiments.tables import MethodOptions, render_table1
 from marl_encircle.experiments.train import run_folder, train
 from marl_encircle.experiments.yaml_files import ConfigError
 
-TABLES = [
-    f"{name}.{kind}"
-    for name in ("table2", "table3", "table4", "table_common_rule", "table_differences")
-    for kind in ("csv", "md")
-]
+TABLES = sorted(
+    [f"table{number}.{kind}" for number in (1, 2, 3, 4) for kind in ("csv", "md", "tex")]
+    + [f"table_{name}.{kind}" for name in ("common_rule", "differences") for kind in ("csv", "md")]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +50,7 @@ def folders(results: Path) -> list[Path]:
 def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) -> None:
     assert counts(reproduce("smoke", tmp_path, 2)) == (2, 0, 0)
     before = tables(tmp_path)
-    assert sorted(before) == sorted(["table1.md", *TABLES])
+    assert sorted(before) == TABLES
     assert counts(reproduce("smoke", tmp_path, 1)) == (0, 0, 2)
     assert tables(tmp_path) == before
 
@@ -99,9 +98,21 @@ def test_a_users_method_by_path_has_its_row(tmp_path: Path) -> None:
     )
     results = tmp_path / "results"
     assert counts(reproduce(str(tmp_path / "grid.yaml"), results, 1)) == (1, 0, 0)
-    row = next(line for line in (results / "tables" / "table4.csv").read_text().splitlines() if "idea" in line)
-    assert "finished" in row or ",8," in row or "1" in row
-    assert "idea" in (results / "tables" / "table4.md").read_text()
+    assert "\nidea,1.1,3,1,random,all,run," in (results / "tables" / "table4.csv").read_text()
+    assert "| idea | not run |" in (results / "tables" / "table4.md").read_text()
+
+
+def test_a_grid_shows_the_methods_it_asks_for_before_they_are_run_and_the_commit_of_its_recipe(tmp_path: Path) -> None:
+    (tmp_path / "idea.yaml").write_text("base: ours\nscale: 0.1\n")
+    (tmp_path / "grid.yaml").write_text(
+        f"profile: smoke\nfrozen: {'0123456789' * 3}abcdef0123\ngroups:\n  - methods: [idea.yaml]\n"
+        "    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]\n    seeds: [1]\nshared: []\n"
+    )
+    write_tables(load_grid(str(tmp_path / "grid.yaml")), tmp_path)
+    rendered = {name: data.decode() for name, data in tables(tmp_path).items()}
+    assert "| idea | not run | not run | not run | not run |" in rendered["table2.md"]
+    for name, text in rendered.items():
+        assert ("recipe frozen in commit 012345678901." in text) == (not name.endswith(".csv")), name
 
 
 def test_runs_that_the_grid_does_not_ask_for_are_not_in_its_tables(tmp_path: Path) -> None:
@@ -122,7 +133,7 @@ def test_a_setting_that_the_paper_lacks_has_its_table_as_long_as_the_grid_asks_f
     assert "tunnel" in (results / "tables" / "table_other.md").read_text()
     assert "tunnel" in (results / "tables" / "table_other.csv").read_text()
     write_tables(load_grid("smoke"), results)
-    assert sorted(tables(results)) == sorted(["table1.md", *TABLES])
+    assert sorted(tables(results)) == TABLES
 
 
 @pytest.mark.parametrize("status", ["finished", "diverged"])

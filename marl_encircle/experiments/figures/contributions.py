@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from marl_encircle.experiments.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.experiments.figures.curves import series_of
 from marl_encircle.experiments.metrics import CellSummary, Estimate
+from marl_encircle.experiments.paper import label
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.tables import label
 
 METHODS = ("ours", "model_c")
 SETTINGS = tuple(Setting(1.1, pursuers, 1) for pursuers in (2, 3, 4, 5))

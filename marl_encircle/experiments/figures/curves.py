@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from marl_encircle.envs.palette import SERIES, Series
 from marl_encircle.experiments.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.experiments.metrics import share_interval
+from marl_encircle.experiments.paper import label
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.tables import label
 
 Array = NDArray[np.float64]
 

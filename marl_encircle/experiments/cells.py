@@ -1,0 +1,99 @@
+"""Cells of the tables: the runs of each over its training seeds, and what they amount to under a closure rule."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from marl_encircle.core.geometry import Closure
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.experiments import metrics
+from marl_encircle.experiments.records import Cell, Episode, Run, Status
+
+OTHER_STATUSES: tuple[Status, ...] = ("diverged", "unfinished", "not evaluated")
+
+
+class CellRuns(NamedTuple):
+    """The runs of one cell.
+
+    :param closure: the method's own closure rule; None if all runs are unfinished
+    :param finished: training seed -> evaluation rounds
+    :param others: status -> training seeds of the runs without rounds
+    :param runs_of: method that the runs are shared with, None if they are the cell's own
+    """
+
+    closure: Closure | None
+    finished: dict[int, Sequence[Episode]]
+    others: dict[Status, list[int]]
+    runs_of: str | None = None
+
+
+class Result(NamedTuple):
+    """One cell under one closure rule.
+
+    :param runs: None if there are none
+    :param closure: the rule that counts as success; None if it is not known
+    :param summary: None without a finished run
+    """
+
+    cell: Cell
+    runs: CellRuns | None
+    closure: Closure | None
+    summary: metrics.CellSummary | None
+
+    @property
+    def status(self) -> str:
+        """``run`` where there are numbers, else what is there instead."""
+        if self.runs is None:
+            return "not run"
+        return "run" if self.summary else ", ".join(status for status in OTHER_STATUSES if self.runs.others[status])
+
+    @property
+    def impossible(self) -> bool:
+        """Whether the pursuers cannot close the circle alone (Eq. 6), have to under the rule, and never did."""
+        setting = self.cell.setting
+        return (
+            self.summary is not None
+            and self.summary.success.mean == 0
+            and self.closure == "pursuers"
+            and not Scenario(pursuers=setting.pursuers, speed_ratio=setting.speed_ratio).solvable_without_obstacles
+        )
+
+
+def gather(runs: Iterable[Run], aliases: Mapping[Cell, Cell]) -> dict[Cell, CellRuns]:
+    """Gather the runs of each cell, in the order of the training seeds.
+
+    :param aliases: cell -> the cell whose runs it shares when it has none of its own
+    :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
+    """
+    cells: dict[Cell, CellRuns] = {}
+    seen = set()
+    for run in sorted(runs, key=lambda run: (run.cell, run.seed)):
+        if (run.cell, run.seed) in seen:
+            raise ValueError(f"{_in_words(run.cell)}: duplicate training seed {run.seed}")
+        seen.add((run.cell, run.seed))
+        entry = cells.get(run.cell, CellRuns(None, {}, {status: [] for status in OTHER_STATUSES}))
+        if None not in (run.closure, entry.closure) and run.closure != entry.closure:
+            raise ValueError(f"{_in_words(run.cell)}: its runs have different closure rules")
+        if run.status == "finished":
+            entry.finished[run.seed] = run.episodes
+        else:
+            entry.others[run.status].append(run.seed)
+        cells[run.cell] = entry._replace(closure=run.closure or entry.closure)
+    shared = {cell: owner for cell, owner in aliases.items() if cell not in cells and owner in cells}
+    return cells | {cell: cells[owner]._replace(runs_of=owner.method) for cell, owner in shared.items()}
+
+
+def result_of(cell: Cell, runs: CellRuns | None, closure: Closure | None = None) -> Result:
+    """Summarise a cell.
+
+    :param closure: the rule that counts as success; None is the method's own
+    """
+    closure = closure or (runs.closure if runs else None)
+    summary = metrics.summarise_cell(runs.finished, closure) if runs and runs.finished and closure else None
+    return Result(cell, runs, closure, summary)
+
+
+def _in_words(cell: Cell) -> str:
+    setting = cell.setting
+    return (
+        f"{cell.method} at ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
+    )

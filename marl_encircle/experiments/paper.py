@@ -1,0 +1,41 @@
+"""What the paper reports: its methods' names and the numbers of its Tables 2-4."""
+
+import csv
+import io
+from importlib import resources
+from typing import NamedTuple
+
+from marl_encircle.experiments.records import Cell, Setting
+
+LABELS = {"ma2019": "Ma", "model_a": "Model A", "model_b": "Model B", "model_c": "Model C", "ours": "Ours"}
+TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
+"""Methods of Tables 2-4 in the paper's order; others follow by name."""
+
+
+class PaperResult(NamedTuple):
+    """What the paper reports for a cell; both None where it has a dash: the method cannot enclose the target there."""
+
+    success_percent: float | None
+    mean_episode_length: float | None
+
+
+def paper_results() -> dict[str, dict[Cell, PaperResult]]:
+    """Read what the paper reports: ``table2`` to ``table4`` -> cell -> numbers, in the paper's order."""
+    data = resources.files("marl_encircle") / "configs" / "paper" / "reported_results.csv"
+    tables: dict[str, dict[Cell, PaperResult]] = {}
+    for row in csv.DictReader(io.StringIO(data.read_text(encoding="utf-8"))):
+        setting = Setting(float(row["speed_ratio"]), int(row["n_pursuers"]), int(row["n_obstacles"]))
+        values = (row["success_percent"], row["mean_episode_length"])
+        result = PaperResult(*(float(value) if value else None for value in values))
+        tables.setdefault(row["table"], {})[Cell(row["method"], setting)] = result
+    return tables
+
+
+def label(method: str) -> str:
+    """Name of a method as the paper writes it; others keep their own."""
+    return LABELS.get(method, method)
+
+
+def rank(method: str) -> tuple[int, str]:
+    """Sort key of methods: those of Tables 2-4 in the paper's order, then the others by name."""
+    return (TABLE_METHODS.index(method) if method in TABLE_METHODS else len(TABLE_METHODS), method)

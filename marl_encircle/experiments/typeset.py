@@ -1,0 +1,161 @@
+"""Tables as text: Markdown, LaTeX (booktabs) and CSV."""
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from marl_encircle.experiments.metrics import Difference, Estimate
+from marl_encircle.experiments.records import Setting
+
+DASH = "–"  # noqa: RUF001 - the paper's own sign
+
+
+@dataclass(frozen=True)
+class Styled:
+    """A part of a text that stands out."""
+
+    text: str
+    style: Literal["bold", "italic"]
+
+
+Part = str | Styled
+Text = Part | tuple[Part, ...]
+"""What a cell or a note holds: one part, or several that follow each other."""
+
+_MARKS = {"bold": "**", "italic": "*"}
+_COMMANDS = {"bold": "textbf", "italic": "textit"}
+# A symbol, alone or with its value, is mathematics; λ = 1.1 becomes $\lambda = 1.1$.
+_MATHEMATICS = re.compile(r"\b[nm] = \d+|λ(?: = [\d.]*\d)?")
+_ESCAPES = {
+    **{sign: f"\\{sign}" for sign in "#$%&_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    DASH: "--",
+    "✓": r"\checkmark",
+}
+
+
+def markdown(
+    title: str, header: Sequence[str], rows: Sequence[Sequence[Text]], notes: Sequence[Text], level: int = 1
+) -> str:
+    """Write a table under its title, with notes below.
+
+    :param level: of the title
+    """
+    table = [[_markdown_text(cell) for cell in row] for row in (header, ["---"] * len(header), *rows)]
+    lines = [f"{'#' * level} {title}", "", *(f"| {' | '.join(cells)} |" for cells in table)]
+    if notes:
+        lines += ["", *(f"- {_markdown_text(note)}" for note in notes)]
+    return "\n".join(lines) + "\n"
+
+
+def latex(name: str, caption: str, header: Sequence[str], rows: Sequence[Sequence[Text]], notes: Sequence[Text]) -> str:
+    """Write a table to be put into a paper, with notes below; rows that start in italics belong to the row above.
+
+    :param name: of the label, ``tab:<name>``
+    """
+    body: list[str] = []
+    grouped = any(_is_italic(row[0]) for row in rows)
+    for row in rows:
+        if grouped and body and not _is_italic(row[0]):
+            body.append(r"\addlinespace")
+        body.append(_latex_row(row))
+    tabular = [
+        rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}",
+        *_indented([r"\toprule", _latex_row(header), r"\midrule", *body, r"\bottomrule"]),
+        r"\end{tabular}",
+    ]
+    small = [r"\begin{minipage}{\linewidth}", *_indented([rf"{_latex_text(note)}\par" for note in notes])]
+    lines = [
+        r"\centering",
+        rf"\caption{{{_latex_text(caption)}}}",
+        rf"\label{{tab:{name}}}",
+        r"\footnotesize",
+        r"\setlength{\tabcolsep}{3pt}",
+        *tabular,
+        *([r"\par\medskip", *small, r"\end{minipage}"] if notes else []),
+    ]
+    packages = "booktabs,amssymb" if any(r"\checkmark" in line for line in body) else "booktabs"
+    return "\n".join([rf"% \usepackage{{{packages}}}", r"\begin{table}", *_indented(lines), r"\end{table}"]) + "\n"
+
+
+def to_csv(records: Sequence[Mapping[str, str]]) -> str:
+    """Write records that have the same keys, which become the header."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, records[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return out.getvalue()
+
+
+def with_interval(estimate: Estimate | Difference, scale: float, form: str) -> tuple[str, str]:
+    """Return the mean and, in brackets after a space, its interval; that is empty where there is none.
+
+    :param form: of each number, ``.1f`` or ``+.2f``
+    """
+    mean, interval = f"{scale * estimate.mean:{form}}", estimate.interval
+    if interval is None:
+        return mean, ""
+    return mean, f" [{scale * interval.low:{form}}, {scale * interval.high:{form}}]"
+
+
+def setting_columns(setting: Setting) -> dict[str, str]:
+    """Return a setting as columns of a CSV file."""
+    return {name: f"{value:g}" if isinstance(value, float) else str(value) for name, value in setting._asdict().items()}
+
+
+def estimate_columns(name: str, estimate: Estimate | Difference | None, scale: float) -> dict[str, str]:
+    """Return mean and interval as three columns of a CSV file, empty where there is nothing."""
+    values = [None, None, None] if estimate is None else [estimate.mean, *(estimate.interval or (None, None))]
+    columns = (name, f"{name}_low", f"{name}_high")
+    return {key: "" if value is None else f"{scale * value:.4f}" for key, value in zip(columns, values, strict=True)}
+
+
+def _parts(cell: Text) -> tuple[Part, ...]:
+    return cell if isinstance(cell, tuple) else (cell,)
+
+
+def _is_italic(cell: Text) -> bool:
+    first = _parts(cell)[0]
+    return isinstance(first, Styled) and first.style == "italic"
+
+
+def _markdown_text(cell: Text) -> str:
+    marked = (
+        part if isinstance(part, str) else f"{_MARKS[part.style]}{part.text}{_MARKS[part.style]}"
+        for part in _parts(cell)
+    )
+    return "".join(marked)
+
+
+def _latex_row(cells: Sequence[Text]) -> str:
+    return rf"{' & '.join(map(_latex_text, cells))} \\"
+
+
+def _latex_text(cell: Text) -> str:
+    escaped = (
+        _escape(part) if isinstance(part, str) else rf"\{_COMMANDS[part.style]}{{{_escape(part.text)}}}"
+        for part in _parts(cell)
+    )
+    return "".join(escaped)
+
+
+def _escape(text: str) -> str:
+    """Put mathematics between dollars and escape everything else that LaTeX would not print."""
+    pieces, end = [], 0
+    for match in _MATHEMATICS.finditer(text):
+        pieces += [_escape_signs(text[end : match.start()]), "$", match[0].replace("λ", r"\lambda"), "$"]
+        end = match.end()
+    return "".join([*pieces, _escape_signs(text[end:])])
+
+
+def _escape_signs(text: str) -> str:
+    return "".join(_ESCAPES.get(sign, sign) for sign in text)
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
