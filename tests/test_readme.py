@@ -1,0 +1,29 @@
+"""The tables that the README shows, between two comments, are those of the results.
+
+They are printed by
+
+    for n in 2 3 4; do awk '/^# /{print "\\n**" substr($0, 3) "**\\n"} /^\\|/' results/tables/table$n.md; done; echo
+"""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BEGIN, END = "<!-- tables -->\n", "<!-- /tables -->\n"
+
+
+def without_notes(text: str) -> str:
+    """Title and rows of a rendered table."""
+    title, *lines = text.splitlines()
+    rows = [line for line in lines if line.startswith("|")]
+    return "\n".join([f"**{title.removeprefix('# ')}**", "", *rows, "", ""])
+
+
+def test_the_readme_shows_tables_2_to_4_as_rendered() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    if BEGIN not in readme:
+        pytest.skip("the README has no tables yet")
+    tables = [(ROOT / "results" / "tables" / f"table{number}.md").read_text(encoding="utf-8") for number in (2, 3, 4)]
+    shown = readme.partition(BEGIN)[2].partition(END)[0]
+    assert shown == "\n" + "".join(map(without_notes, tables))
