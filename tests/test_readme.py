@@ -1,8 +1,8 @@
-"""The tables that the README shows, between two comments, are those of the results.
+r"""The tables that the README shows, between two comments, are those of the results.
 
 They are printed by
 
-    for n in 2 3 4; do awk '/^# /{print "\\n**" substr($0, 3) "**\\n"} /^\\|/' results/tables/table$n.md; done; echo
+    for n in 2 3 4; do awk '/^# /{print "\n**" substr($0, 3) "**\n"} /^\|/' results/tables/table$n.md; done; echo
 """
 
 from pathlib import Path
