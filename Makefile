@@ -26,7 +26,7 @@ export OMP_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
 .PHONY: help setup test test-sb3 check lint format format-check typecheck imports spelling \
-        train evaluate sweep tables calibrate verify-results reproduce-tables bench tensorboard clean
+        train evaluate sweep tables figures calibrate verify-results reproduce-tables bench tensorboard clean
 
 help:  ## list the targets and the variables
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / {printf "  %-18s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -79,6 +79,9 @@ sweep: $(READY)  ## train and evaluate what is missing of GRID: GRID JOBS RESULT
 
 tables: $(READY)  ## render the tables from the runs there are: RESULTS
 	$(CLI) tables --out $(RESULTS)
+
+figures: $(READY)  ## draw the figures from the runs there are: GRID RESULTS
+	$(CLI) figures --grid $(GRID) --out $(RESULTS)
 
 calibrate: $(READY)  ## choose the study's scenario by its protocol: JOBS RESULTS
 	$(CLI) calibrate --out $(RESULTS)/calibration --jobs $(JOBS)

@@ -232,6 +232,18 @@ def tables(
         typer.echo(str(path))
 
 
+@app.command()
+def figures(
+    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
+    out: Results = Path("results"),
+) -> None:
+    """Draw Figures 1 and 3 to 6 from the runs there are."""
+    from marl_encircle.experiments.figures.write import write_figures
+
+    for path in write_figures(load_grid(grid), out):
+        typer.echo(str(path))
+
+
 @app.command("reproduce-tables")
 def reproduce_tables(
     grid: Annotated[str, typer.Option(help="committed, smoke, all, or the path of a YAML file.")] = "committed",
