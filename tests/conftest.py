@@ -1,6 +1,8 @@
-"""Hypothesis profiles: ``quick`` by default, HYPOTHESIS_PROFILE=thorough for 1,000 examples of each law."""
+"""One thread, as in the Makefile. Hypothesis: ``quick``, or HYPOTHESIS_PROFILE=thorough for 1,000 examples of a law."""
 
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # libraries read it when they are imported
 
 from hypothesis import HealthCheck, settings
 
