@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from torch import nn
 
 from marl_encircle.maddpg.buffers import JointReplayBuffer
-from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients
+from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
 from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
@@ -135,6 +135,10 @@ class MADDPG(OffPolicyAlgorithm):
             exploration_noise = 0.3 if action_noise is None else 0.0
         self.exploration_noise = exploration_noise
         self.exploration_random = exploration_random
+        if policy_delay < 1:
+            raise ValueError(f"policy_delay must be at least 1, but got {policy_delay}")
+        if max_grad_norm is not None and max_grad_norm <= 0:
+            raise ValueError(f"max_grad_norm must be positive or None, but got {max_grad_norm}")
         self.policy_delay = policy_delay
         self.max_grad_norm = max_grad_norm
         self.actor_regularization = actor_regularization
@@ -216,6 +220,7 @@ class MADDPG(OffPolicyAlgorithm):
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         assert self.replay_buffer is not None
 
+        by_hand = is_plain(self.actor) and is_plain(self.critic)
         actor_losses: list[th.Tensor] = []
         critic_losses: list[th.Tensor] = []
         for _ in range(gradient_steps):
@@ -229,16 +234,14 @@ class MADDPG(OffPolicyAlgorithm):
                 target_q_values = batch.rewards.T + (1 - batch.dones.T) * self.gamma * next_q_values
 
             # Critics: minimise the mean of (y_i - Q_i(s, a_1 .. a_n))^2, Eq. 3
-            critic_losses.append(critic_gradients(self.critic, batch.observations, batch.actions, target_q_values))
+            obs, actions = batch.observations, batch.actions
+            critic_losses.append(critic_gradients(self.critic, obs, actions, target_q_values, by_hand))
             self._step(self.critic)
 
             if self._n_updates % self.policy_delay == 0:
                 # Actors: ascend the mean of Q_i(s, a_1 .. mu_i(o_i) .. a_n), Eq. 2
-                actor_losses.append(
-                    actor_gradients(
-                        self.actor, self.critic, batch.observations, batch.actions, self.actor_regularization
-                    )
-                )
+                regularization = self.actor_regularization
+                actor_losses.append(actor_gradients(self.actor, self.critic, obs, actions, regularization, by_hand))
                 self._step(self.actor)
 
                 # Targets follow slowly

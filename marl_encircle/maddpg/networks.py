@@ -38,9 +38,9 @@ class StackedMLP(nn.Module):
     ) -> None:
         super().__init__()
         self.n = n
-        is_relu = activation_fn is nn.ReLU
-        self.activation = nn.ReLU(inplace=True) if is_relu else activation_fn()
-        self.has_backward = is_relu and len(net_arch) > 0
+        self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
+        if any(True for _ in self.activation.parameters()):
+            raise ValueError(f"activation_fn must have no parameters: networks would share them; got {activation_fn}")
         dims = [input_dim, *net_arch]
         layers = list(zip(dims[:-1], net_arch, strict=True))
         self.weights = nn.ParameterList(uniform_parameter(n, i, o, fan_in=i) for i, o in layers)
@@ -48,13 +48,16 @@ class StackedMLP(nn.Module):
         n_heads = n if n_heads is None else n_heads
         self.head_weight = uniform_parameter(n_heads, dims[-1], output_dim, fan_in=dims[-1])
         self.head_bias = uniform_parameter(n_heads, 1, output_dim, fan_in=dims[-1])
-        # Looking them up in the modules at every call would take longer
-        self._layers = list(zip(self.weights, self.biases, strict=True))
 
     @property
     def dtype(self) -> th.dtype:
         """The weights' precision."""
         return self.head_weight.dtype
+
+    @property
+    def layers(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """Weights and biases of the hidden layers."""
+        return list(zip(self.weights, self.biases, strict=True))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """Return the outputs of all heads, shape (max(m, n_heads), B, out).
@@ -73,16 +76,19 @@ class StackedMLP(nn.Module):
 
         :param x: inputs, shape (m, B, in); with ``changes``, shape (1, B, in)
         :param changes: what head i adds to its columns of ``x``, shape (n_heads, B, U)
-        :param columns: these columns, shape (n_heads, U)
+        :param columns: these columns, shape (n_heads, U); given with ``changes``
         """
-        if changes is not None and columns is not None and not self._layers:
-            x = x.expand(len(changes), -1, -1).scatter_add(2, columns[:, None].expand_as(changes), changes)
-        activations = [x]
-        for weight, bias in self._layers:
-            sums = (activations[-1] @ weight).add_(bias)
-            if changes is not None and columns is not None and len(activations) == 1:
-                sums = (changes @ self.first_weight(columns)).add_(sums)
-            activations.append(self.activation(sums))
+        layers = self.layers
+        sums = [(x @ weight).add_(bias) for weight, bias in layers[:1]]
+        if changes is not None:
+            assert columns is not None
+            if layers:
+                sums = [(changes @ self.first_weight(columns)).add_(sums[0])]
+            else:
+                x = x.expand(len(changes), -1, -1).scatter_add(2, columns[:, None].expand_as(changes), changes)
+        activations = [x, *map(self.activation, sums)]
+        for weight, bias in layers[1:]:
+            activations.append(self.activation((activations[-1] @ weight).add_(bias)))
         return activations
 
     def first_weight(self, columns: th.Tensor) -> th.Tensor:
@@ -107,7 +113,9 @@ class StackedMLP(nn.Module):
         return products.reshape(-1, self.head_weight.shape[2], hidden.shape[1]).mT + self.head_bias
 
     def backward(self, activations: list[th.Tensor], grad: th.Tensor, constant: bool = False) -> th.Tensor:
-        """Set the parameters' gradients as autograd's ``backward`` does, in half of its time; ``has_backward`` only.
+        """Set the parameters' gradients by hand; for one or more hidden layers of ReLU.
+
+        Former gradients are replaced. Hooks and ``requires_grad`` are not looked at: see ``gradients.is_plain``.
 
         :param activations: of the network's layers; the list is emptied
         :param grad: gradient of the outputs, shape (max(m, n_heads), B, out)
@@ -122,7 +130,7 @@ class StackedMLP(nn.Module):
             self.head_weight.grad = grad_weight.view_as(self.head_weight.mT).mT.contiguous()
             self.head_bias.grad = grad.sum(1, keepdim=True).sum_to_size(self.head_bias.shape)
         grad = grad_rows.mT @ rows
-        for weight, bias in reversed(self._layers):
+        for weight, bias in reversed(self.layers):
             th.ops.aten.threshold_backward.grad_input(grad, above, 0, grad_input=grad)
             above = activations.pop()
             if not constant:

@@ -4,7 +4,7 @@ Shape legend: B minibatch, N agents, O observation size, U action size.
 """
 
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
@@ -29,11 +29,6 @@ class AgentModel(BaseModel):
     """What actor and critic have in common: features of every agent's observation, in the model's own precision."""
 
     features_extractor: BaseFeaturesExtractor
-
-    @property
-    def only_flattens(self) -> bool:
-        """Whether the features are the observation itself, so that there is nothing to learn below the networks."""
-        return cast(AgentFeatures, self.features_extractor).only_flattens
 
     def agent_features(self, obs: th.Tensor, dtype: th.dtype) -> th.Tensor:
         """Features of the joint observation.
@@ -98,11 +93,6 @@ class Actor(AgentModel, BasePolicy):
             "activation_fn": self.activation_fn,
             "share_parameters": self.share_parameters,
         }
-
-    @property
-    def has_backward(self) -> bool:
-        """Whether gradients can do without autograd, see ``StackedMLP.backward``."""
-        return self.mu.has_backward and self.only_flattens
 
     def logits(self, obs: th.Tensor) -> th.Tensor:
         """Actions before squashing, shape (B, N, U).
@@ -188,11 +178,6 @@ class CentralCritic(AgentModel):
         return list(self.q_networks)  # type: ignore[arg-type]  # a ModuleList forgets what it holds
 
     @property
-    def has_backward(self) -> bool:
-        """Whether gradients can do without autograd, see ``StackedMLP.backward``."""
-        return self.networks[0].has_backward and self.only_flattens
-
-    @property
     def dtype(self) -> th.dtype:
         """The networks' precision."""
         return self.networks[0].dtype
@@ -221,7 +206,7 @@ class CentralCritic(AgentModel):
     ) -> tuple[th.Tensor, th.Tensor]:
         """Return ``own_action_values`` and the gradient of each Q_i with respect to a_i, shapes (N, B) and (N, B, U).
 
-        The parameters are constants; ``has_backward`` only.
+        The parameters are constants; for networks that ``StackedMLP.backward`` knows.
         """
         network = self.networks[0]
         activations = self._own_action_activations(obs, actions, own_actions)

@@ -1,13 +1,16 @@
 """The losses' gradients: by hand and by autograd they are the same."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients
+from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
+from marl_encircle.maddpg.networks import StackedMLP
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 N_AGENTS, BATCH_SIZE, OBSERVATION_SIZE, ACTION_SIZE = 3, 7, 5, 2
@@ -39,19 +42,19 @@ def policy(activation_fn: type[nn.Module], **kwargs: Any) -> MADDPGPolicy:
 def test_by_hand_and_by_autograd_are_the_same(critic: str, n_critics: int, share_parameters: bool) -> None:
     how: dict[str, Any] = {"critic": critic, "n_critics": n_critics, "share_parameters": share_parameters}
     by_hand, by_autograd = policy(nn.ReLU, **how), policy(Rectifier, **how)
-    assert by_hand.actor.has_backward
-    assert by_hand.critic.has_backward
-    assert not by_autograd.actor.has_backward
-    assert not by_autograd.critic.has_backward
+    assert is_plain(by_hand.actor)
+    assert is_plain(by_hand.critic)
+    assert not is_plain(by_autograd.actor)
+    assert not is_plain(by_autograd.critic)
     obs = th.randn(BATCH_SIZE, N_AGENTS, OBSERVATION_SIZE, dtype=th.float64)
     actions = 2 * th.rand(BATCH_SIZE, N_AGENTS, ACTION_SIZE, dtype=th.float64) - 1
     targets = th.randn(N_AGENTS, BATCH_SIZE, dtype=th.float64)
 
-    losses = [critic_gradients(p.critic, obs, actions, targets) for p in (by_hand, by_autograd)]
+    losses = [critic_gradients(p.critic, obs, actions, targets, p is by_hand) for p in (by_hand, by_autograd)]
     th.testing.assert_close(losses[0], losses[1], rtol=1e-12, atol=1e-12)
     critic_grads = assert_same_gradients(by_hand.critic, by_autograd.critic)
 
-    losses = [actor_gradients(p.actor, p.critic, obs, actions, 0.3) for p in (by_hand, by_autograd)]
+    losses = [actor_gradients(p.actor, p.critic, obs, actions, 0.3, p is by_hand) for p in (by_hand, by_autograd)]
     th.testing.assert_close(losses[0], losses[1], rtol=1e-12, atol=1e-12)
     assert_same_gradients(by_hand.actor, by_autograd.actor)
     # The critics' gradients are those of their own loss
@@ -70,3 +73,96 @@ def assert_same_gradients(first: nn.Module, second: nn.Module) -> list[th.Tensor
     th.testing.assert_close(one, other, rtol=1e-11, atol=1e-12)
     assert all(grad.abs().max() > 0 for grad in one)
     return one
+
+
+def freeze(model: Any, network: StackedMLP) -> None:
+    network.weights[0].requires_grad_(False)
+
+
+def hook_a_parameter(model: Any, network: StackedMLP) -> None:
+    network.head_weight.register_hook(lambda grad: grad * 0)
+
+
+def hook_after_accumulation(model: Any, network: StackedMLP) -> None:
+    network.head_weight.register_post_accumulate_grad_hook(lambda parameter: parameter.grad.zero_())
+
+
+def hook_a_module(model: Any, network: StackedMLP) -> None:
+    network.register_forward_hook(lambda module, args, output: output * 2)
+
+
+def hook_a_gradient(model: Any, network: StackedMLP) -> None:
+    network.register_full_backward_hook(lambda module, grad_input, grad_output: None)
+
+
+def parametrize(model: Any, network: StackedMLP) -> None:
+    nn.utils.parametrize.register_parametrization(network, "head_weight", nn.Identity())
+
+
+def parametrize_a_hidden_layer(model: Any, network: StackedMLP) -> None:
+    nn.utils.parametrize.register_parametrization(network.weights, "0", nn.Identity())
+
+
+def replace_the_activation(model: Any, network: StackedMLP) -> None:
+    network.activation = nn.Tanh()
+
+
+def subclass(model: Any, network: StackedMLP) -> None:
+    model.__class__ = type("Mine", (type(model),), {})
+
+
+CHANGES = [
+    freeze,
+    hook_a_parameter,
+    hook_after_accumulation,
+    hook_a_module,
+    hook_a_gradient,
+    parametrize,
+    parametrize_a_hidden_layer,
+    replace_the_activation,
+    subclass,
+]
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+def test_what_a_user_changes_is_left_to_autograd(change: Callable[[Any, StackedMLP], None]) -> None:
+    for name in ("actor", "critic"):
+        model = getattr(policy(nn.ReLU), name)
+        assert is_plain(model)
+        change(model, model.mu if name == "actor" else model.networks[0])
+        assert not is_plain(model)
+
+
+def test_other_networks_are_left_to_autograd() -> None:
+    assert not is_plain(policy(nn.ReLU, features_extractor_class=Scaled).critic)
+    th.manual_seed(0)
+    twins = policy(nn.ReLU, n_critics=2).critic
+    twins.q_networks[1] = twins.q_networks[0]
+    assert not is_plain(twins)
+    linear = MADDPGPolicy(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,)), lambda _: 1e-3, N_AGENTS, net_arch=[])
+    assert not is_plain(linear.actor)
+    with th.autocast("cpu"):
+        assert not is_plain(policy(nn.ReLU).actor)
+
+
+class Scaled(FlattenExtractor):
+    """Features that are not the observation itself."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return 2 * super().forward(observations)
+
+
+def test_frozen_parameters_and_unused_ones_have_no_gradient() -> None:
+    p = policy(nn.ReLU)
+    frozen = p.critic.networks[0].weights[0].requires_grad_(False)
+    p.critic.unused = nn.Parameter(th.zeros(1))
+    obs = th.randn(BATCH_SIZE, N_AGENTS, OBSERVATION_SIZE, dtype=th.float64)
+    actions = th.zeros(BATCH_SIZE, N_AGENTS, ACTION_SIZE, dtype=th.float64)
+    critic_gradients(p.critic, obs, actions, th.zeros(N_AGENTS, BATCH_SIZE, dtype=th.float64), by_hand=False)
+    assert frozen.grad is None
+    assert p.critic.unused.grad is None
+    assert p.critic.networks[0].weights[1].grad is not None
+    actor_gradients(
+        p.actor, p.critic, obs, actions, 0.0, by_hand=False
+    )  # a frozen critic is as good as any for the actors
+    assert all(parameter.grad is not None for parameter in p.actor.parameters())

@@ -57,7 +57,6 @@ def test_gradients_by_hand_equal_those_of_autograd(case: str, net_arch: list[int
     n, n_heads, m = CASES[case]
     th.manual_seed(0)
     network = StackedMLP(n, 5, net_arch, output_dim, n_heads=n_heads).double()
-    assert network.has_backward
     x = th.randn(m, 7, 5, dtype=th.float64)
     weights = th.randn(max(m, n_heads), 7, output_dim, dtype=th.float64)
     parameters = list(network.parameters())
@@ -76,10 +75,8 @@ def test_constant_parameters_get_no_gradients() -> None:
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
-def test_other_networks_are_left_to_autograd() -> None:
+def test_other_activations_are_those_of_torch() -> None:
     network = StackedMLP(2, 5, [4], 1, nn.Tanh).double()
-    assert not network.has_backward
-    assert not StackedMLP(2, 5, [], 1).has_backward
     x = th.randn(2, 7, 5, dtype=th.float64, requires_grad=True)
     assert th.autograd.gradcheck(network, x)
     by_hand = th.tanh(x @ network.weights[0] + network.biases[0]) @ network.head_weight + network.head_bias
@@ -105,6 +102,18 @@ def test_changes_equal_other_inputs(n: int, net_arch: list[int], activation_fn: 
     (expected_grad,) = th.autograd.grad(expected.square().sum(), changes)
     (grad,) = th.autograd.grad(outputs.square().sum(), changes)
     th.testing.assert_close(grad, expected_grad, rtol=1e-12, atol=1e-12)
+
+
+def test_an_activation_that_learns_is_refused() -> None:
+    with pytest.raises(ValueError, match="activation_fn must have no parameters"):
+        StackedMLP(2, 5, [4], 1, nn.PReLU)
+
+
+def test_replaced_parameters_are_used() -> None:
+    network = StackedMLP(2, 5, [4], 1)
+    x = th.randn(2, 7, 5)
+    network.load_state_dict(StackedMLP(2, 5, [4], 1).state_dict(), assign=True)
+    th.testing.assert_close(network(x), plain_outputs(network, x))
 
 
 def test_weights_start_like_those_of_linear_layers() -> None:
