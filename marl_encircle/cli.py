@@ -414,7 +414,7 @@ def main() -> None:
         app()
     except (ConfigError, PlacementError, locks.FolderLockedError) as error:
         _fail(error, 2)
-    except files.DamagedFileError as error:
+    except (files.DamagedFileError, locks.UnfitLockError) as error:
         _fail(error, 3)
     except Stopped as stopped:
         _fail(stopped, 128 + stopped.signum)

@@ -1,14 +1,20 @@
 """A folder for one process at a time, by the kernel's lock on a file in it."""
 
+import errno
 import fcntl
 import json
 import os
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LOCK_NAME = ".lock"
+
+# The folder may be a stranger's: its lock must not lead to another file, which would be overwritten.
+_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+_UNFIT = (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV)  # a link, a folder, a socket, no device behind it
 
 _held_locks: set[int] = set()
 
@@ -29,6 +35,10 @@ class FolderLockedError(RuntimeError):
         self.host = host
 
 
+class UnfitLockError(OSError):
+    """What has the name of the lock is no lock file; it is left as it is."""
+
+
 @contextmanager
 def folder_lock(folder: str | Path) -> Iterator[None]:
     """Keep a folder to this process while the block runs.
@@ -38,6 +48,7 @@ def folder_lock(folder: str | Path) -> Iterator[None]:
 
     :param folder: the folder; made if missing
     :raises FolderLockedError: another process (or another block of this one) holds it, with its pid and host
+    :raises UnfitLockError: if the lock file is a link or no regular file
     :raises OSError: with the name of the lock file
     """
     path = Path(folder) / LOCK_NAME
@@ -45,7 +56,9 @@ def folder_lock(folder: str | Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = _acquire(path)
     except OSError as error:
-        raise OSError(error.errno, f"the folder cannot be locked: {error.strerror or error}", str(path)) from error
+        unfit = isinstance(error, UnfitLockError) or error.errno in _UNFIT
+        kind, reason = (UnfitLockError, "not a file of its own") if unfit else (OSError, error.strerror or error)
+        raise kind(error.errno, f"the folder cannot be locked: {reason}", str(path)) from error
     try:
         yield
     finally:
@@ -59,8 +72,11 @@ def folder_lock(folder: str | Path) -> Iterator[None]:
 def _acquire(path: Path) -> int:
     """Lock the file of that name and write down who holds it; returns the open descriptor."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(path, _FLAGS, 0o666)
         try:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+                raise UnfitLockError(errno.EINVAL, "not a file of its own")
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _still_named(descriptor, path):  # else its former holder removed it between our open and our lock
                 os.ftruncate(descriptor, 0)
@@ -77,7 +93,7 @@ def _acquire(path: Path) -> int:
 def _still_named(descriptor: int, path: Path) -> bool:
     """Whether the open file is the one that has the name."""
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
+        return os.path.samestat(os.fstat(descriptor), path.lstat())
     except FileNotFoundError:
         return False
 

@@ -141,6 +141,18 @@ def test_a_locked_folder_ends_with_2_naming_pid_and_host(run: Run, runs: Path) -
     assert f"process {os.getpid()} on host {socket.gethostname()}" in done.err
 
 
+def test_a_lock_that_leads_elsewhere_ends_with_3_by_name(run: Run, runs: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim.txt"
+    victim.write_text("mine")
+    folder = train.run_folder(load_config(profile="smoke"), 0, runs)
+    folder.mkdir(parents=True)
+    (folder / ".lock").symlink_to(victim)
+    done = run("train", "--profile", "smoke", "--out", runs)
+    assert (done.code, victim.read_text()) == (3, "mine")
+    assert str(folder / ".lock") in done.err
+    assert "Traceback" not in done.err
+
+
 def test_a_folder_that_cannot_be_written_ends_with_1_by_name(run: Run, runs: Path) -> None:
     runs.write_text("a file")
     done = run("train", "--profile", "smoke", "--out", runs)

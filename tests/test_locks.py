@@ -5,7 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -117,6 +117,40 @@ def test_a_folder_that_cannot_be_locked_is_an_error_that_names_the_lock(tmp_path
     (tmp_path / ".lock").mkdir()
     with pytest.raises(OSError, match=r"cannot be locked.*/\.lock"), locks.folder_lock(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("make", [Path.symlink_to, Path.hardlink_to])
+def test_a_lock_that_is_a_link_leaves_the_other_file_alone(tmp_path: Path, make: Callable[[Path, Path], None]) -> None:
+    folder, victim = tmp_path / "folder", tmp_path / "victim.txt"
+    folder.mkdir()
+    victim.write_text("mine")
+    make(folder / ".lock", victim)
+    with (
+        pytest.raises(locks.UnfitLockError, match=r"cannot be locked: not a file of its own: .*/\.lock"),
+        locks.folder_lock(folder),
+    ):
+        pass
+    assert victim.read_text() == "mine"
+    assert (folder / ".lock").exists()
+
+
+def test_a_lock_that_points_nowhere_makes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / ".lock").symlink_to(tmp_path / "new.txt")
+    with pytest.raises(locks.UnfitLockError), locks.folder_lock(tmp_path / "folder"):
+        pass
+    assert not (tmp_path / "new.txt").exists()
+
+
+def test_a_lock_that_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / ".lock")
+    with pytest.raises(locks.UnfitLockError), locks.folder_lock(tmp_path):
+        pass
+    (tmp_path / ".lock").unlink()
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(tmp_path / ".lock"))
+        with pytest.raises(locks.UnfitLockError), locks.folder_lock(tmp_path):
+            pass
 
 
 def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
