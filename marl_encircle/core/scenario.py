@@ -161,9 +161,24 @@ class Scenario:
     @property
     def cover(self) -> float:
         """Share of the scene that all bodies cover; overlaps within a composite obstacle count twice."""
-        obstacles = self.obstacles * float((SCENES[self.scene]()[:, 2] ** 2).sum()) * self.obstacle_radius**2
+        obstacles = self._squared_radii * self.obstacle_radius**2
         others = self.pursuers * self.pursuer_radius**2 + self.target_radius**2
         return math.pi * (obstacles + others) / (2 * self.half_width) ** 2
+
+    def obstacle_radius_at(self, cover: float) -> float:
+        """Return the obstacle radius at which all bodies would cover so much of the scene; needs an obstacle.
+
+        :param cover: share of the scene, see :attr:`cover`
+        :return: radius [scene units]; 0.0 where pursuers and target alone cover more
+        """
+        others = self.pursuers * self.pursuer_radius**2 + self.target_radius**2
+        obstacles = cover * (2 * self.half_width) ** 2 / math.pi - others
+        return math.sqrt(max(0.0, obstacles) / self._squared_radii)
+
+    @property
+    def _squared_radii(self) -> float:
+        """Sum of the squared radii of all obstacles' discs [obstacle radii^2]."""
+        return self.obstacles * float((SCENES[self.scene]()[:, 2] ** 2).sum())
 
     @property
     def solvable_without_obstacles(self) -> bool:
@@ -174,7 +189,7 @@ class Scenario:
 def _check(name: str, value: object, hint: Any, metadata: Any) -> None:
     """Raise a ValueError unless ``value`` has the field's type and lies within its bounds."""
     if get_origin(hint) is Literal:
-        if value not in get_args(hint):
+        if not isinstance(value, str) or value not in get_args(hint):
             raise ValueError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}; got {value!r:.80}")
     elif hint in (int, float):
         kind = numbers.Integral if hint is int else numbers.Real
@@ -186,7 +201,7 @@ def _check(name: str, value: object, hint: Any, metadata: Any) -> None:
             raise ValueError(f"{name} must be {allowed}; got {value!r:.80}")
     elif get_origin(hint) is tuple:
         extras = get_args(Extra)
-        if not isinstance(value, tuple) or any(extra not in extras for extra in value):
+        if not isinstance(value, tuple) or any(not isinstance(extra, str) or extra not in extras for extra in value):
             raise ValueError(f"{name} must be a tuple of {', '.join(extras)}; got {value!r:.80}")
     elif not isinstance(value, hint):
         raise ValueError(f"{name} must be a {hint.__name__}; got {value!r:.80}")

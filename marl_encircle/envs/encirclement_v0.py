@@ -37,9 +37,11 @@ def parallel_env(
     :param max_cycles: steps after which a round is truncated; the scenario's by default
     :param render_mode: None, ``human`` or ``rgb_array``
     :param scenario_fields: fields of the scenario to change, such as ``speed_ratio=1.3``
-    :raises TypeError: for a field that a scenario does not have, naming the nearest
+    :raises TypeError: for what is no scenario, or a field that a scenario does not have, naming the nearest
     :raises ValueError: for a value out of range, an unknown term or render mode
     """
+    if scenario is not None and not isinstance(scenario, Scenario):
+        raise TypeError(f"scenario must be a Scenario or None; got {scenario!r:.80}")
     known = [f.name for f in fields(Scenario)]
     for name in scenario_fields:
         if name not in known:

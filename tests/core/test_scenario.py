@@ -11,6 +11,7 @@ from core_worlds import arranged, push
 from marl_encircle.core import dynamics
 from marl_encircle.core.dynamics import TARGETS
 from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.scenes import SCENES
 from marl_encircle.core.simulator import Simulator
 
 HINTS = get_type_hints(Scenario)
@@ -134,6 +135,22 @@ def test_more_bodies_than_a_byte_can_number_are_refused() -> None:
 def test_a_misspelt_field_is_an_error() -> None:
     with pytest.raises(TypeError, match="pursuer_count"):
         Scenario(pursuer_count=3)  # type: ignore[call-arg]
+
+
+def test_the_radius_at_a_cover_is_covers_inverse() -> None:
+    for scene in SCENES:
+        s = Scenario(scene=scene, obstacles=2, pursuers=4, half_width=1.5)
+        assert s.obstacle_radius_at(s.cover) == pytest.approx(s.obstacle_radius)
+    # Two discs and four bodies of 0.05 in a scene of area 4: pi (2 R^2 + 4 x 0.0025) / 4 = pi / 4 x 0.19 at R = 0.3
+    assert Scenario(obstacles=2).obstacle_radius_at(0.19 * math.pi / 4) == pytest.approx(0.3)
+    assert Scenario().obstacle_radius_at(0.001) == 0.0
+
+
+@pytest.mark.parametrize("value", [np.array(["soft", "hard"]), np.array("soft"), ["soft"], None, 1])
+def test_a_choice_that_is_no_text_names_the_field(value: Any) -> None:
+    assert refused(contacts=value).startswith("contacts must be one of soft, hard, off; got ")
+    assert refused(observe_extras=(value,)).startswith("observe_extras must be a tuple of ")
+    assert refused(scene=value).startswith("scene must be a str; got ")
 
 
 def test_units_and_discs_count_composite_obstacles_as_told() -> None:

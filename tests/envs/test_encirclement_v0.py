@@ -314,6 +314,8 @@ def test_metadata_say_what_it_is() -> None:
 
 
 def test_an_unknown_field_is_an_error_that_names_the_nearest() -> None:
+    with pytest.raises(TypeError, match="scenario must be a Scenario or None; got 'default'"):
+        parallel_env("default")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"speed_rato: unknown scenario field; did you mean speed_ratio\?"):
         parallel_env(speed_rato=1.3)
 
