@@ -216,5 +216,5 @@ class Reward:
 
 def nearest(name: str, known: Any) -> str:
     """Return '; did you mean ...?' for a misspelt name, or what is known."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
+    close = difflib.get_close_matches(name, sorted(known), n=1)
+    return f"; did you mean {close[0]}?" if close else f"; known: {', '.join(sorted(known))}"

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from marl_encircle import files
 from marl_encircle.core.observations import bounds
 from marl_encircle.core.rewards import nearest
+from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -22,6 +23,7 @@ from marl_encircle.experiments.config import (
     Config,
     Profile,
     Schedule,
+    check_curriculum,
     load_config,
 )
 from marl_encircle.experiments.records import read_record
@@ -36,7 +38,7 @@ def make_vec_env(
     reward: str | Path = "ours",
     n_worlds: int = 64,
     *,
-    scenario: str | Path = "default",
+    scenario: str | Path | Scenario = "default",
     engine: Engine = "native",
     seed: int | None = None,
     curriculum: bool = True,
@@ -48,7 +50,7 @@ def make_vec_env(
 
     :param reward: a method's name or the path of its YAML file
     :param n_worlds: worlds side by side
-    :param scenario: a name in ``configs/scenario/``, or the path of a YAML file
+    :param scenario: a name in ``configs/scenario/``, the path of a YAML file, or a ``Scenario``
     :param engine: ``native``, fast, or ``supersuit``, the PettingZoo environment through SuperSuit; equal seeds give
         equal trajectories
     :param seed: of the worlds; without one they start from fresh entropy. Those of ``evaluation.seed`` are the rounds
@@ -73,9 +75,11 @@ def make_vec_env(
 def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, curriculum: bool = True) -> VecEnv:
     """Return the environment that a configuration trains in.
 
-    :raises ConfigError: for an unknown engine
+    :raises ConfigError: for an unknown engine, or a curriculum that starts where the scene is not allowed
     """
     check_engine(engine)
+    if curriculum:
+        check_curriculum(config)
     scenario, reward = config.scenario, config.reward.build()
     worlds: VecEnv
     if engine == "native":

@@ -4,10 +4,11 @@ A configuration has five sections, each read from the file that :mod:`marl_encir
 ``--set section.key=value`` changes last.
 """
 
+import dataclasses
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
@@ -27,10 +28,10 @@ from pydantic import (
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import Reward, nearest
-from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml
+from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, parse_yaml
 from marl_encircle.maddpg import ALGORITHMS
 
 Profile = Literal["full", "smoke"]
@@ -175,8 +176,7 @@ class Config(Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved configuration as plain data."""
         sections = self.model_dump(exclude={"scenario"})
-        scenario = {**asdict(self.scenario), "observe_extras": list(self.scenario.observe_extras)}
-        return {"reward": sections.pop("reward"), "scenario": scenario, **sections}
+        return {"reward": sections.pop("reward"), "scenario": _fields_of(self.scenario), **sections}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
@@ -201,39 +201,53 @@ def load_config(
     *,
     algorithm: str | Path = "maddpg",
     profile: Profile = "full",
-    scenario: str | Path = "default",
+    scenario: str | Path | Scenario = "default",
     fields: Mapping[str, Any] | None = None,
     overrides: Sequence[str] = (),
 ) -> Config:
     """Return the checked configuration of a run.
 
     The training section is ``<profile>.yaml`` where the pursuers alone can close the circle (Eq. 6), else
-    ``<profile>_obstacles.yaml``: the curriculum and the budget follow from the setting, for every method alike.
+    ``<profile>_obstacles.yaml``: the curriculum and the budget follow from the setting, for every method alike. A
+    first obstacle radius of that file at which the bodies would cover more than half of the scene, the most that can be
+    placed, becomes the one at which they cover a quarter, or the final one where that is larger.
 
     :param reward: a name in ``ablations/`` or ``baselines/``, or the path of a YAML file
     :param algorithm: a name in ``configs/algorithm/``, or a path
     :param profile: ``full``, or ``smoke`` for a few seconds
-    :param scenario: a name in ``configs/scenario/``, or a path
+    :param scenario: a name in ``configs/scenario/``, a path, or a ``Scenario``
     :param fields: fields of ``Scenario`` that differ from it
     :param overrides: ``section.key=value`` each, the value in YAML
     :raises ConfigError: naming file or key, the value, and what is allowed
     """
-    reward, algorithm, scenario = os.fspath(reward), os.fspath(algorithm), os.fspath(scenario)
+    reward, algorithm = _name_of(reward, "reward"), _name_of(algorithm, "algorithm")
+    if profile not in get_args(Profile):
+        raise ConfigError(f"profile {profile!r:.80}: unknown profile{nearest(str(profile), get_args(Profile))}")
     changes = _parse_overrides(overrides)
-    changed_fields = merge(fields or {}, changes.get("scenario", {}))
-    world = _build_scenario(merge(library.load_section("scenario", scenario), changed_fields))
-    budget = profile if world.solvable_without_obstacles else f"{profile}_obstacles"
+    changes["scenario"] = merge(fields or {}, changes.get("scenario", {}))
+    names = {"reward": reward, "algorithm": algorithm, "evaluation": profile}
+    if isinstance(scenario, Scenario):
+        own_fields = _fields_of(scenario)
+    else:
+        names["scenario"] = _name_of(scenario, "scenario")
+        own_fields = library.load_section("scenario", names["scenario"])
+    with _naming_files(names, {}):
+        _check_fields(own_fields)  # also those that a change would hide
+    with _naming_files(names, changes):
+        world = _build_scenario(merge(own_fields, changes["scenario"]))
+    names["training"] = profile if world.solvable_without_obstacles else f"{profile}_obstacles"
     sections = {
         "reward": library.load_reward(reward),
         "algorithm": library.load_section("algorithm", algorithm),
-        "training": library.load_section("training", budget),
+        "training": _fitted(library.load_section("training", names["training"]), world),
         "evaluation": library.load_section("evaluation", profile),
     }
     merged = {name: merge(section, changes.get(name, {})) for name, section in sections.items()}
     named = merged["reward"].get("name")
     if named == Path(reward).stem and not re.match(METHOD_NAME, named):
         raise ConfigError(f"{reward}: {named!r:.80} is not a method name; add 'name:' with letters, digits, _ . or -")
-    return _checked(world, merged)
+    with _naming_files(names, changes):
+        return _checked(world, merged)
 
 
 def check_seed(config: Config, seed: int) -> None:
@@ -255,6 +269,7 @@ def check_training(config: Config) -> None:
 
     :raises ConfigError: naming the keys
     """
+    check_curriculum(config)
     random, total = config.algorithm.random_world_steps, config.training.world_steps
     if random >= total:
         raise ConfigError(
@@ -262,6 +277,21 @@ def check_training(config: Config) -> None:
             f"learnt; got {random}"
         )
     _check_memory(config)
+
+
+def check_curriculum(config: Config) -> None:
+    """Refuse a curriculum that starts where the scene is not allowed; only who trains by it needs one.
+
+    :raises ConfigError: naming the key and how to change it
+    """
+    for name, ramp in config.training.curriculum.items():
+        if ramp is not None:
+            key = f"training.curriculum.{name}"
+            try:
+                _build_scenario({**_fields_of(config.scenario), name: ramp.start})
+            except ConfigError as error:
+                remedy = f"--set {key}.start=... to another value, or --set {key}=null for none"
+                raise ConfigError(f"{key}.start: {error}; {remedy}") from error
 
 
 def difference(
@@ -281,7 +311,11 @@ def difference(
 
 def _parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
     changes: dict[str, Any] = {}
+    if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+        raise ConfigError(f"overrides must be a list of section.key=value; got {overrides!r:.80}")
     for override in overrides:
+        if not isinstance(override, str):
+            raise ConfigError(f"overrides must be a list of section.key=value; one is {override!r:.80}")
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
@@ -311,13 +345,12 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
         raise ConfigError(f"reward.{error}") from error
     if not reward.active:
         raise ConfigError("reward.terms: all are off; at least one needs a weight")
-    _check_curriculum(config)
     _check_networks(config)
     return config
 
 
 def _build_scenario(values: Mapping[str, Any]) -> Scenario:
-    known = [f.name for f in fields(Scenario)]
+    known = [f.name for f in dataclasses.fields(Scenario)]
     for key in values:
         if key not in known:
             raise ConfigError(f"scenario.{key:.80}: unknown key{nearest(key, known)}")
@@ -327,6 +360,62 @@ def _build_scenario(values: Mapping[str, Any]) -> Scenario:
     except ValueError as error:
         about_a_field = str(error).split()[0] in known
         raise ConfigError(f"scenario{'.' if about_a_field else ': '}{error}") from error
+
+
+def _check_fields(values: Mapping[str, Any]) -> None:
+    """Refuse a field that is wrong whatever the others are."""
+    try:
+        _build_scenario(values)
+    except ConfigError as error:
+        if str(error).startswith("scenario."):
+            raise
+
+
+def _fields_of(scenario: Scenario) -> dict[str, Any]:
+    return {**dataclasses.asdict(scenario), "observe_extras": list(scenario.observe_extras)}
+
+
+def _fitted(training: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """Return the values of a training section of the package, its obstacles small enough at first for this scene."""
+    ramp = training["curriculum"].get("obstacle_radius")
+    if ramp is None or not scenario.obstacles or ramp["start"] <= scenario.obstacle_radius_at(MAX_COVER):
+        return dict(training)
+    start = max(round(scenario.obstacle_radius_at(MAX_COVER / 2), 3), scenario.obstacle_radius)
+    return merge(training, {"curriculum": {"obstacle_radius": {"start": start}}})
+
+
+def _name_of(given: object, kind: str) -> str:
+    """Return the name or path of a file."""
+    if not isinstance(given, (str, Path)):
+        raise ConfigError(f"{kind} must be a name or the path of a YAML file; got {given!r:.80}")
+    return str(given)
+
+
+@contextmanager
+def _naming_files(names: Mapping[str, str], changes: Mapping[str, Any]) -> Iterator[None]:
+    """Put the file in front of every line of a ConfigError that is about a key which stands in one.
+
+    :param names: of the sections' files
+    :param changes: values by section that stand in none
+    """
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError("\n".join(_with_file(line, names, changes) for line in str(error).splitlines())) from error
+
+
+def _with_file(line: str, names: Mapping[str, str], changes: Mapping[str, Any]) -> str:
+    section, *keys = line.split(":")[0].split(" ")[0].split(".")
+    if section not in names:
+        return line
+    for length in range(len(keys), -1, -1):  # a key that is missing stands where its mapping does
+        changed = changes.get(section, {})
+        if changed and holds(changed, keys[:length]):
+            return line
+        path = library.file_of(section, names[section], keys[:length])
+        if path is not None:
+            return f"{path}: {line}"
+    return line
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
@@ -359,15 +448,6 @@ def _known_keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str
             annotation = inner[-1]
     sections = [each for each in (annotation, *get_args(annotation)) if isinstance(each, type)]
     return [name for each in sections if issubclass(each, BaseModel) for name in each.model_fields]
-
-
-def _check_curriculum(config: Config) -> None:
-    for name, ramp in config.training.curriculum.items():
-        if ramp is not None:
-            try:
-                _build_scenario({**config.to_dict()["scenario"], name: ramp.start})
-            except ValueError as error:
-                raise ConfigError(f"training.curriculum.{name}.start: {error}") from error
 
 
 def _check_networks(config: Config) -> None:

@@ -5,12 +5,12 @@
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from marl_encircle.core.rewards import nearest
-from marl_encircle.experiments.yaml_files import ConfigError, merge, read_yaml
+from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, read_yaml
 
 PACKAGE = Path(__file__).parent.parent
 
@@ -28,9 +28,7 @@ def load_reward(name: str) -> dict[str, Any]:
     :param name: a name in ``ablations/`` or ``baselines/``, or the path of a YAML file
     :raises ConfigError: naming the file, and the nearest name
     """
-    folders = _reward_folders()
-    section = _load(find_file(name, folders, "reward"), folders, "reward")
-    return {"name": Path(name).stem, **section}
+    return {"name": Path(name).stem, **load_section("reward", name)}
 
 
 def load_section(section: str, name: str) -> dict[str, Any]:
@@ -40,8 +38,20 @@ def load_section(section: str, name: str) -> dict[str, Any]:
     :param name: a name in that folder, or the path of a YAML file
     :raises ConfigError: naming the file, and the nearest name
     """
-    folders = [PACKAGE / "configs" / section]
+    folders = _folders(section)
     return _load(find_file(name, folders, section), folders, section)
+
+
+def file_of(section: str, name: str, keys: Sequence[str]) -> Path | None:
+    """Return the file in which a key stands: the last one of a chain of bases that has it, or None.
+
+    :param section: ``reward`` or a folder of ``configs/``
+    :param name: what :func:`load_reward` or :func:`load_section` was called with
+    :param keys: path of the key below the section
+    """
+    folders = _folders(section)
+    chain = _chain(find_file(name, folders, section), folders, section)
+    return next((path for path, values in chain if holds(values, keys)), None)
 
 
 def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
@@ -62,30 +72,45 @@ def is_path(name: str) -> bool:
     return name.lower().endswith((".yaml", ".yml")) or os.sep in name
 
 
+def _folders(section: str) -> list[Path]:
+    return _reward_folders() if section == "reward" else [PACKAGE / "configs" / section]
+
+
 def _reward_folders() -> list[Path]:
     """``ablations`` and ``baselines``: in the package of a built install, beside it in a checkout."""
     roots = (PACKAGE, PACKAGE.parent)
     return [root / name for name in ("ablations", "baselines") for root in roots if (root / name).is_dir()]
 
 
-def _load(path: Path, folders: Iterable[Path], kind: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+def _load(path: Path, folders: Iterable[Path], kind: str) -> dict[str, Any]:
     """Read a file on top of its base's."""
-    real = os.path.realpath(path)
-    if real in seen:
-        raise ConfigError(f"{path}: circular base; it leads back to this file")
-    if len(seen) > MAX_BASES:
-        raise ConfigError(f"{path}: more than {MAX_BASES} nested bases")
-    values = read_yaml(path)
-    base = values.pop("base", None)
-    if base is None:
-        return values
-    if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
-        raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
-    try:
-        below = path.parent / base if is_path(base) else find_file(base, folders, kind)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: base: {error}") from error
-    inherited = _load(below, folders, kind, (*seen, real))
-    if kind == "reward":  # a changed method is another one: without a name of its own, its file's
-        inherited.pop("name", None)
-    return merge(inherited, values)
+    values: dict[str, Any] = {}
+    for _, below in reversed(_chain(path, folders, kind)):
+        if kind == "reward":  # a changed method is another one: without a name of its own, its file's
+            values.pop("name", None)
+        values = merge(values, below)
+    return values
+
+
+def _chain(path: Path, folders: Iterable[Path], kind: str) -> list[tuple[Path, dict[str, Any]]]:
+    """Return a file, its base, that one's base and so on, each with the values that stand in it."""
+    chain: list[tuple[Path, dict[str, Any]]] = []
+    seen: list[str] = []
+    while True:
+        real = os.path.realpath(path)
+        if real in seen:
+            raise ConfigError(f"{path}: circular base; it leads back to this file")
+        if len(seen) > MAX_BASES:
+            raise ConfigError(f"{path}: more than {MAX_BASES} nested bases")
+        seen.append(real)
+        values = read_yaml(path)
+        base = values.pop("base", None)
+        chain.append((path, values))
+        if base is None:
+            return chain
+        if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
+            raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
+        try:
+            path = path.parent / base if is_path(base) else find_file(base, folders, kind)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: base: {error}") from error

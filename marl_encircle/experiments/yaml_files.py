@@ -5,7 +5,7 @@ YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a duplicate key
 
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -130,3 +130,12 @@ def merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any
         below = merged.get(key)
         merged[key] = merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return merged
+
+
+def holds(values: Any, keys: Sequence[str]) -> bool:
+    """Whether there is a value at a path of keys."""
+    for key in keys:
+        if not isinstance(values, Mapping) or key not in values:
+            return False
+        values = values[key]
+    return True

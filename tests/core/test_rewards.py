@@ -229,7 +229,7 @@ def test_with_obstacles_they_do_not() -> None:
 
 WRONG: dict[str, tuple[Callable[[], Reward], str]] = {
     "unknown term": (lambda: Reward({"contracton": 1.0}), r"terms\.contracton: unknown .*did you mean contraction\?"),
-    "nothing like it": (lambda: Reward({"zzz": 1.0}), r"terms\.zzz: .*known: overall_angle, contributing_angle"),
+    "nothing like it": (lambda: Reward({"zzz": 1.0}), r"terms\.zzz: .*known: collision, completion"),
     "unknown parameter": (
         lambda: Reward({"contraction": {"weight": 1, "capp": 2}}),
         r"terms\.contraction\.capp: unknown parameter; did you mean cap\?",

@@ -16,6 +16,7 @@ from tiny_runs import copy_of_finished, finished, tiny
 
 from marl_encircle import files
 from marl_encircle.core.observations import layout
+from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
@@ -75,6 +76,20 @@ def test_equal_seeds_make_equal_worlds_and_none_makes_others() -> None:
     assert not np.array_equal(first(None), first(None))
 
 
+def test_a_scenario_is_taken_as_it_is() -> None:
+    scenario = Scenario(pursuers=4, obstacles=2, observe_extras=("stage",))
+    assert make_vec_env(n_worlds=1, scenario=scenario).get_attr("scenario") == [scenario] * 4
+    assert make_vec_env(n_worlds=1, scenario=scenario, pursuers=2).num_envs == 2
+
+
+@pytest.mark.parametrize("ramp", ["obstacle_radius={start: 0.9, world_steps: 9}", "speed_ratio.start=0.5"])
+def test_only_who_wants_the_curriculum_needs_one_that_can_be_played(ramp: str) -> None:
+    how: dict[str, Any] = {"n_worlds": 1, "pursuers": 2, "overrides": [f"training.curriculum.{ramp}"]}
+    assert curriculum(make_vec_env(curriculum=False, **how)).difficulty == {}
+    with pytest.raises(ConfigError, match=r"^training\.curriculum\.\w+\.start: scenario"):
+        make_vec_env(**how)
+
+
 def test_a_users_file_and_overrides_reach_the_worlds(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("base: ours\nterms: {time: 3.0, contraction: null}\n")
@@ -94,6 +109,9 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
 @pytest.mark.parametrize(
     ("how", "reason"),
     [
+        ({"overrides": "scenario.damping=0.3"}, "overrides must be a list of section.key=value; got 'scenario."),
+        ({"profile": None}, "profile None: unknown profile; known: full, smoke"),
+        ({"scenario": 3}, "scenario must be a name or the path of a YAML file; got 3"),
         ({"pursuer": 3}, "scenario.pursuer: unknown key; did you mean pursuers?"),
         ({"pursuers": "3"}, "scenario.pursuers must be an integer"),
         ({"reward": "our"}, "did you mean ours?"),

@@ -11,6 +11,8 @@ import yaml_cases
 
 from marl_encircle import maddpg
 from marl_encircle.core.rewards import Reward
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.simulator import Simulator
 from marl_encircle.experiments.config import (
     Config,
     check_seed,
@@ -94,6 +96,58 @@ def test_the_curriculum_follows_from_eq_6_for_every_method_alike(
         assert ramps == ({"safety_distance"} if alone else {"obstacle_radius", "speed_ratio"})
         longer = config.training.world_steps > 1_000_000
         assert longer == (profile == "full" and not alone)
+
+
+@pytest.mark.parametrize("profile", ["full", "smoke"])
+def test_the_obstacles_of_the_papers_settings_start_as_the_file_says(profile: Any) -> None:
+    for radius in (0.15, 0.2, 0.25):
+        for ratio, pursuers, obstacles in ((1.1, 2, 1), *((r, 3, m) for r in (1.2, 1.3, 1.4) for m in (1, 2, 3))):
+            setting = {"speed_ratio": ratio, "pursuers": pursuers, "obstacles": obstacles, "obstacle_radius": radius}
+            assert start_of_radius(load_config(profile=profile, fields=setting)) == 0.45
+
+
+@pytest.mark.parametrize(
+    ("scene", "obstacles", "start"),
+    [
+        # A quarter of the scene: pi (m s R^2 + 3 x 0.0025) / 4 = 0.25, s = 1, 7 x 0.16, 10 x 0.16
+        ("random", 4, 0.279),
+        ("concave", 3, 0.304),
+        ("tunnel", 2, 0.312),
+        ("tunnel", 5, 0.2),  # 0.197, but they are not to grow
+    ],
+)
+def test_obstacles_that_would_not_fit_at_first_start_at_a_quarter_of_the_scene(
+    scene: str, obstacles: int, start: float
+) -> None:
+    config = load_config(fields={"pursuers": 2, "scene": scene, "obstacles": obstacles})
+    assert start_of_radius(config) == start
+    check_training(config)
+    simulator = Simulator(config.scenario, n_worlds=16, seed=0)
+    simulator.set_difficulty({"obstacle_radius": start})
+    simulator.reset()
+
+
+@pytest.mark.parametrize(
+    ("ramp", "reason"),
+    [
+        ("speed_ratio={start: 0.5, world_steps: 9}", "speed_ratio.start: scenario.speed_ratio must be between"),
+        ("obstacle_radius={start: 0.9, world_steps: 9}", "obstacle_radius.start: scenario: too many bodies"),
+        ("obstacle_radius={start: 1e200, world_steps: 9}", "obstacle_radius.start: scenario: the bodies are too large"),
+    ],
+)
+def test_a_first_value_that_cannot_be_played_is_refused_for_a_training_with_the_remedy(ramp: str, reason: str) -> None:
+    config = load_config(overrides=[f"training.curriculum.{ramp}"])  # which may be shown
+    with pytest.raises(ConfigError) as caught:
+        check_training(config)
+    key = "training.curriculum." + ramp.partition("=")[0]
+    assert str(caught.value).startswith(f"training.curriculum.{reason}")
+    assert str(caught.value).endswith(f"; --set {key}.start=... to another value, or --set {key}=null for none")
+
+
+def start_of_radius(config: Config) -> float:
+    ramp = config.training.curriculum["obstacle_radius"]
+    assert ramp is not None
+    return ramp.start
 
 
 def test_null_switches_the_curriculum_off() -> None:
@@ -248,7 +302,7 @@ def test_a_bad_file_is_refused_by_name_and_reason(tmp_path: Path, text: str | by
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     message = refused(str(path))
     assert reason in message
-    assert message.startswith((str(tmp_path), "reward."))
+    assert message.startswith(f"{tmp_path}/")
     assert_short(message.replace(str(path), ""))
 
 
@@ -272,6 +326,39 @@ def assert_short(message: str) -> None:
         assert len(line) < 800
         assert "x" * 81 not in line
         assert "9" * 81 not in line
+
+
+def test_what_is_wrong_is_told_with_the_file_that_says_it(tmp_path: Path) -> None:
+    base = write(tmp_path, "base.yaml", "base: ours\nscale: true\nterms: {time: [3]}\n")
+    top = write(tmp_path, "top.yaml", "base: base.yaml\nclosure: both\n")
+    assert refused(top).splitlines() == [
+        f"{top}: reward.closure: input should be 'all' or 'pursuers'; got 'both'",
+        f"{base}: reward.scale: input should be a valid number; got True",
+    ]
+    assert refused(top, overrides=["reward.closure=all", "reward.scale=1"]).startswith(
+        f"{base}: reward.terms.time.weight must be a finite number"
+    )
+    assert refused(top, overrides=["reward.closure=any", "reward.scale=1"]).startswith("reward.closure: ")
+    algorithm = write(tmp_path, "mine.yaml", "base: maddpg\nupdates: 3\n")
+    assert refused(algorithm=algorithm).startswith(f"{algorithm}: algorithm.updates: unknown key; known: actor_")
+
+
+def test_a_scenarios_file_is_told_also_where_a_change_would_hide_its_fault(tmp_path: Path) -> None:
+    path = write(tmp_path, "mine.yaml", "aceleration: 3\n")
+    assert refused(scenario=path) == f"{path}: scenario.aceleration: unknown key; did you mean acceleration?"
+    path = write(tmp_path, "mine.yaml", "speed_ratio: 0.3\n")
+    for changes in ({}, {"speed_ratio": 1.2}):
+        assert refused(scenario=path, fields=changes).startswith(f"{path}: scenario.speed_ratio must be between")
+    path = write(tmp_path, "mine.yaml", "obstacles: 30\n")
+    assert refused(scenario=path).startswith(f"{path}: scenario: too many bodies")
+    assert load_config(scenario=path, fields={"obstacles": 2}).scenario.obstacles == 2
+    assert refused(scenario=path, fields={"pursuers": 4}).startswith("scenario: too many bodies")
+
+
+def test_a_scenario_may_be_given_as_it_is() -> None:
+    scenario = Scenario(pursuers=4, observe_extras=("stage",))
+    assert load_config(scenario=scenario).scenario == scenario
+    assert load_config(scenario=scenario, fields={"pursuers": 3}).scenario.pursuers == 3
 
 
 def test_there_are_many_cases() -> None:
