@@ -9,7 +9,7 @@ from marl_encircle.experiments.cells import CellRuns, Result
 from marl_encircle.experiments.metrics import Difference
 from marl_encircle.experiments.paper import label
 from marl_encircle.experiments.records import Cell
-from marl_encircle.experiments.typeset import estimate_columns, markdown, setting_columns, to_csv, with_interval
+from marl_encircle.experiments.typeset import Table, estimate_columns, markdown, setting_columns, to_csv, with_interval
 
 _HEADER = ["Other method", "λ", "n", "m", "Closure ours / other", "S, points", "MEL, steps", "Seeds"]
 _NOTES = [
@@ -37,12 +37,18 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
     :param notes: further ones
     :return: ``table_differences.md`` and ``.csv`` -> text
     """
-    rows = [row for cell in cells if cell.method != "ours" for row in _rows(cell, runs)]
-    shown = [_shown(row) for row in rows]
+    cells = list(cells)
+    table = difference_table(cells, runs, notes)
     return {
-        "table_differences.md": markdown("Ours minus the others", _HEADER, shown, [*_NOTES, *notes]),
-        "table_differences.csv": to_csv([_record(row) for row in rows]),
+        "table_differences.md": markdown(table.title, table.header, table.rows, table.notes),
+        "table_differences.csv": to_csv([_record(row) for row in _all_rows(cells, runs)]),
     }
+
+
+def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
+    """Return the same as a table."""
+    shown = [_shown(row) for row in _all_rows(cells, runs)]
+    return Table("table_differences", "Ours minus the others", _HEADER, shown, [*_NOTES, *notes])
 
 
 def best(column: Iterable[Result]) -> Result | None:
@@ -71,6 +77,10 @@ def _is_higher(first: Result, second: Result) -> bool:
         return False
     difference = metrics.success_difference(first.runs.finished, second.runs.finished, first.closure, second.closure)
     return difference is not None and difference.verdict == "higher"
+
+
+def _all_rows(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns]) -> list[_Row]:
+    return [row for cell in cells if cell.method != "ours" for row in _rows(cell, runs)]
 
 
 def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:

@@ -8,13 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from marl_encircle.experiments.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of
-from marl_encircle.experiments.differences import render_differences
+from marl_encircle.experiments.differences import difference_table, render_differences
 from marl_encircle.experiments.paper import PaperResult, label, paper_results, rank
 from marl_encircle.experiments.paper_layout import LAYOUTS, notes_on, seeds_of, success_and_length, wide
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.experiments.typeset import (
     DASH,
     Styled,
+    Table,
     Text,
     estimate_columns,
     latex,
@@ -81,10 +82,15 @@ def render_tables(
     frozen_note = _frozen_note(frozen)
     rendered: dict[str, str] = {}
     for name, paper in reported.items():
-        rendered |= _main_table(name, _ordered(paper, cells), by_cell, paper, frozen_note)
+        results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
+        rendered |= _texts(_main_table(name, results, paper, frozen_note))
+        rendered[f"{name}.csv"] = to_csv([_record(result, paper.get(result.cell)) for result in results])
     rendered |= _common_table(cells, by_cell, reported, frozen_note)
     if others:
-        rendered |= _other_table([result_of(cell, by_cell[cell]) for cell in others], frozen_note)
+        results = [result_of(cell, by_cell[cell]) for cell in others]
+        other = _other_table(results, frozen_note)
+        rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
+        rendered["table_other.csv"] = to_csv([_record(result, None) for result in results])
     return rendered | render_differences(cells, by_cell, frozen_note)
 
 
@@ -95,17 +101,47 @@ def render_table1(options: Mapping[str, MethodOptions], frozen: str | None = Non
     :param frozen: as in ``render_tables``
     :return: file name -> text
     """
-    rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
-    header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
     records = [
         {"method": method, **{name: "yes" if has else "no" for name, has in row._asdict().items()}}
         for method, row in options.items()
     ]
-    notes = _frozen_note(frozen)
+    return {**_texts(table1(options, frozen)), "table1.csv": to_csv(records)}
+
+
+def table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> Table:
+    """Table 1 as a table; see :func:`render_table1`."""
+    rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
+    header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
+    return Table("table1", _TABLE1, header, rows, _frozen_note(frozen))
+
+
+def main_tables(
+    runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[Cell], frozen: str | None = None
+) -> list[Table]:
+    """Tables 2-4 and, where there are any, the results of other settings; then the paired differences.
+
+    What is in them is what :func:`render_tables` writes, whose parameters these are.
+    """
+    by_cell = gather(runs, aliases)
+    reported = paper_results()
+    cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
+    others = _by_method(by_cell.keys() - set(cells))
+    note = _frozen_note(frozen)
+    tables = [
+        _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, note)
+        for name, paper in reported.items()
+    ]
+    if others:
+        tables.append(_other_table([result_of(cell, by_cell[cell]) for cell in others], note))
+    return [*tables, difference_table(cells, by_cell, note)]
+
+
+def _texts(table: Table) -> dict[str, str]:
+    """Write one of the paper's tables in Markdown and LaTeX."""
+    title = f"Table {table.name.removeprefix('table')}: {table.title}"
     return {
-        "table1.md": markdown(f"Table 1: {_TABLE1}", header, rows, notes),
-        "table1.tex": latex("table1", _TABLE1, header, rows, notes),
-        "table1.csv": to_csv(records),
+        f"{table.name}.md": markdown(title, table.header, table.rows, table.notes),
+        f"{table.name}.tex": latex(table.name, table.title, table.header, table.rows, table.notes),
     }
 
 
@@ -126,22 +162,13 @@ def _by_method(cells: Iterable[Cell]) -> list[Cell]:
 
 
 def _main_table(
-    name: str,
-    cells: Sequence[Cell],
-    runs: Mapping[Cell, CellRuns],
-    paper: Mapping[Cell, PaperResult],
-    frozen_note: Sequence[str],
-) -> dict[str, str]:
+    name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], frozen_note: Sequence[str]
+) -> Table:
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
-    results = [result_of(cell, runs.get(cell)) for cell in cells]
     header, rows, seeds = wide(layout, results, paper)
     notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper), *seeds, *frozen_note]
-    return {
-        f"{name}.md": markdown(f"Table {name.removeprefix('table')}: {layout.title}", header, rows, notes),
-        f"{name}.tex": latex(name, layout.title, header, rows, notes),
-        f"{name}.csv": to_csv([_record(result, paper.get(result.cell)) for result in results]),
-    }
+    return Table(name, layout.title, header, rows, notes)
 
 
 def _common_table(
@@ -166,7 +193,7 @@ def _common_table(
     }
 
 
-def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> dict[str, str]:
+def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> Table:
     """Cells of other settings, a line for each."""
     rows = [
         [
@@ -179,10 +206,7 @@ def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> dict[
         for result in results
     ]
     notes = [_OWN_RULE_NOTE, *notes_on(results, {}), *frozen_note]
-    return {
-        "table_other.md": markdown(_OTHER, _OTHER_HEADER, rows, notes),
-        "table_other.csv": to_csv([_record(result, None) for result in results]),
-    }
+    return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
 
 
 def _owner(result: Result) -> str | None:

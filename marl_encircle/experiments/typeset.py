@@ -5,7 +5,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from marl_encircle.experiments.metrics import Difference, Estimate
 from marl_encircle.experiments.records import Setting
@@ -24,6 +24,19 @@ class Styled:
 Part = str | Styled
 Text = Part | tuple[Part, ...]
 """What a cell or a note holds: one part, or several that follow each other."""
+
+
+class Table(NamedTuple):
+    """A table as it is before it is written in any of the languages."""
+
+    name: str
+    """Of its files, without suffix."""
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Text]]
+    """Rows that start in italics belong to the row above."""
+    notes: Sequence[Text]
+
 
 _MARKS = {"bold": "**", "italic": "*"}
 _COMMANDS = {"bold": "textbf", "italic": "textit"}
