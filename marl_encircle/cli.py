@@ -10,12 +10,11 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch as th
 import typer
 from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 from tqdm import tqdm
 
@@ -26,9 +25,12 @@ from marl_encircle.experiments.calibrate import CalibrationError, calibrate, loa
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config, Profile, difference, load_config
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.executors import Executor, LocalExecutor
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.library import PACKAGE, reward_names
+from marl_encircle.experiments.live import LiveReport
 from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.experiments.ray_executor import RayExecutor
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.reproduce import reproduce, write_tables
 from marl_encircle.experiments.sweep import Progress, sweep
@@ -57,6 +59,16 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Override: section.
 Out = Annotated[Path, typer.Option(help="Folder of runs.")]
 Results = Annotated[Path, typer.Option(help="Folder of runs/ and tables/.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Runs at a time, one processor core each.")]
+ExecutorName = Literal["local", "ray"]
+ExecutorOption = Annotated[
+    ExecutorName,
+    typer.Option(
+        "--executor", help="local: this machine; ray: a Ray cluster, all of whose nodes see the folder of runs."
+    ),
+]
+Address = Annotated[
+    str | None, typer.Option(help="Ray cluster, HOST:PORT. Default: one on this machine alone, on loopback.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
 
@@ -185,11 +197,14 @@ def sweep_command(
     grid: Annotated[str, typer.Argument(help="committed, smoke, all, or the path of a YAML file.")],
     jobs: Jobs = 1,
     out: Out = Path("results/runs"),
+    executor: ExecutorOption = "local",
+    address: Address = None,
     as_json: AsJson = False,
 ) -> None:
     """Train the missing runs of a grid."""
-    with _live() as report:
-        progress = sweep(load_grid(grid).jobs, out, jobs, report)
+    wanted, workers = load_grid(grid).jobs, _executor(executor, address)
+    with LiveReport() as report:
+        progress = sweep(wanted, out, jobs, report, workers)
     counts = {
         "done": progress.done,
         "running": len(progress.running),
@@ -216,7 +231,7 @@ def calibrate_command(
     and the chosen scenario.
     """
     plan = load_protocol(protocol)
-    with _live() as report:
+    with LiveReport() as report:
         calibrate(plan, out, jobs, report)
     typer.echo((out / "sensitivity.md").read_text(encoding="utf-8"))
     typer.echo(str(out / "scenario.yaml"))
@@ -249,10 +264,13 @@ def reproduce_tables(
     grid: Annotated[str, typer.Option(help="committed, smoke, all, or the path of a YAML file.")] = "committed",
     out: Results = Path("results"),
     jobs: Jobs = 1,
+    executor: ExecutorOption = "local",
+    address: Address = None,
 ) -> None:
     """Train and evaluate what is missing of a grid, and render Tables 1-4 beside the paper's numbers."""
-    with _live() as report:
-        done = reproduce(grid, out, jobs, report)
+    workers = _executor(executor, address)
+    with LiveReport() as report:
+        done = reproduce(grid, out, jobs, report, workers)
     for number in (2, 3, 4):
         typer.echo((out / "tables" / f"table{number}.md").read_text(encoding="utf-8"))
     typer.echo(f"trained={done.trained} evaluated={done.evaluated} reused={done.reused}")
@@ -366,34 +384,12 @@ def _print_pairs(values: dict[str, Any]) -> None:
         typer.echo(f"{key:<{width}}  {value:.4f}" if isinstance(value, float) else f"{key:<{width}}  {value}")
 
 
-class _live:  # noqa: N801 - used like a function
-    """A table of where a sweep stands on the terminal; one line per change where there is no terminal."""
-
-    def __enter__(self) -> Any:
-        self.console = Console(stderr=True)
-        self.live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
-        self.last = ""
-        if self.live:
-            self.live.start()
-        return self.report
-
-    def __exit__(self, *error: object) -> None:
-        if self.live:
-            self.live.stop()
-
-    def report(self, progress: Progress) -> None:
-        """Show the present state."""
-        line = (
-            f"done {progress.done}, diverged {progress.diverged}, failed {len(progress.failed)}, left {progress.left}"
-            f"{'; running: ' + ', '.join(progress.running) if progress.running else ''}"
-        )
-        if line == self.last:
-            return
-        self.last = line
-        if self.live:
-            self.live.update(line, refresh=True)
-        else:
-            self.console.print(line, soft_wrap=True)
+def _executor(name: ExecutorName, address: str | None) -> Executor:
+    if name == "ray":
+        return RayExecutor(address)
+    if address is not None:
+        raise ConfigError(f"--address {address} needs --executor ray; the executor local has no address")
+    return LocalExecutor()
 
 
 def _advance(bar: Any, done: int, total: int) -> None:

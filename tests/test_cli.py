@@ -25,9 +25,9 @@ from tiny_runs import (
 )
 
 from marl_encircle import cli, files, locks
+from marl_encircle.experiments import executors, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
-from marl_encircle.experiments import train
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.metrics import wilson_interval
 
@@ -342,7 +342,7 @@ class Made:
 @pytest.fixture
 def _tiny_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grids, "load_config", lambda *a, **k: load_config(*a, **{**k, "overrides": TINY}))
-    monkeypatch.setattr(sweeps, "_start", Made)
+    monkeypatch.setattr(executors, "_start", Made)
     monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
 
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from marl_encircle.cli import main
 from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments import executors
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.config import Config, load_config
@@ -78,7 +79,7 @@ def everything_in(folder: Path) -> list[str]:
 
 def train_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare a sweep's workers the start of a process."""
-    monkeypatch.setattr(sweeps, "_start", Trained)
+    monkeypatch.setattr(executors, "_start", Trained)
     monkeypatch.setattr(sweeps, "POLL_SECONDS", 0.0)
 
 

@@ -1,24 +1,41 @@
-"""Many runs, each a single-threaded process of its own; whatever stops a sweep, the next one goes on from there."""
+"""Many runs; whatever stops a sweep, the next one goes on from there."""
 
-import ctypes
-import os
-import signal
-import subprocess
-import sys
+import heapq
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import mean
+from typing import Any, NamedTuple
 
 from marl_encircle import locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
-from marl_encircle.experiments.grid import Job, arguments
+from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
+from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 POLL_SECONDS = 0.2
-GRACE_SECONDS = 10.0
+
+
+class Running(NamedTuple):
+    """A run that a worker trains.
+
+    :param total: world steps of its whole training
+    """
+
+    name: str
+    folder: Path
+    total: int
+
+    @property
+    def world_steps(self) -> int:
+        """World steps at the latest point of its learning curve."""
+        try:
+            lines = (self.folder / "progress.csv").read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return 0
+        return int(lines[-1].partition(",")[0]) if len(lines) > 1 else 0
 
 
 @dataclass
@@ -26,62 +43,71 @@ class Progress:
     """Where a sweep stands; counts of runs.
 
     :param total: runs asked for
+    :param n_workers: runs at a time
+    :param cpu_seconds: processor time of each run that finished in this sweep
     """
 
     total: int
+    n_workers: int = 1
     done: int = 0
     reused: int = 0
     diverged: int = 0
     failed: list[str] = field(default_factory=list)
-    running: list[str] = field(default_factory=list)
+    running: list[Running] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
 
     @property
     def left(self) -> int:
         """Runs that are neither done, diverged, failed nor running."""
         return self.total - self.done - self.diverged - len(self.failed) - len(self.running)
 
+    @property
+    def seconds_left(self) -> float | None:
+        """Time [s] to the end if each run takes the mean processor time of those finished; None before the first."""
+        shares = [1 - run.world_steps / run.total for run in self.running] + [1.0] * self.left
+        if not shares:
+            return 0.0
+        if not self.cpu_seconds:
+            return None
+        free = [0.0] * self.n_workers  # when each worker has done its part
+        for share in shares:
+            heapq.heapreplace(free, free[0] + share)
+        return max(free) * mean(self.cpu_seconds)
+
 
 def sweep(
-    jobs: Sequence[Job], out: str | Path, n_workers: int, report: Callable[[Progress], None] | None = None
+    jobs: Sequence[Job],
+    out: str | Path,
+    n_workers: int,
+    report: Callable[[Progress], None] | None = None,
+    executor: Executor | None = None,
 ) -> Progress:
     """Train what is missing of ``jobs``.
 
     :param out: folder of runs; a second sweep on it is refused
-    :param n_workers: processes at a time
-    :param report: called whenever a run starts or ends
+    :param n_workers: runs at a time
+    :param report: called whenever a run starts or ends, and several times a second in between
+    :param executor: how they run; by default as processes of this machine
     :return: how it ended; ``failed`` names the runs that did not finish
     :raises FolderLockedError: if another sweep works in ``out``
     :raises OtherRunError: if a finished run there has another configuration
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
     """
-    with locks.folder_lock(out), stop_signals() as caught:
-        progress = Progress(total=len(jobs))
+    with locks.folder_lock(out):
+        progress = Progress(len(jobs), n_workers)
         waiting = []
         for job in jobs:
-            if _finished(job, out):
-                progress.reused += 1
-                _count(job, out, progress)
-            else:
+            record = _record_of(job, out)
+            if record is None:
                 waiting.append(job)
-        running: dict[subprocess.Popen[bytes], Job] = {}
-        try:
-            while waiting or running:
-                while waiting and len(running) < n_workers and not caught:
-                    job = waiting.pop(0)
-                    running[_start(job, out)] = job
-                _report(progress, running, report)
-                time.sleep(POLL_SECONDS)
-                if caught:
-                    raise Stopped(caught[0])
-                for process in [process for process in running if process.poll() is not None]:
-                    job = running.pop(process)
-                    if _finished(job, out):
-                        _count(job, out, progress)
-                    else:
-                        progress.failed.append(name_of(job))
-        finally:
-            _stop(list(running))
-        _report(progress, running, report)
+            else:
+                progress.reused += 1
+                _count(record, progress)
+        report = report or (lambda _: None)
+        if waiting:
+            with executor or LocalExecutor() as workers:
+                _train(waiting, out, workers, progress, report)
+        report(progress)
         return progress
 
 
@@ -91,56 +117,51 @@ def name_of(job: Job) -> str:
     return f"{job.reward} ratio{s.speed_ratio:g}_n{s.pursuers}_m{s.obstacles}_{s.scene} seed{job.seed}"
 
 
-def _finished(job: Job, out: str | Path) -> bool:
+def _train(
+    waiting: list[Job], out: str | Path, executor: Executor, progress: Progress, report: Callable[[Progress], None]
+) -> None:
+    """Keep as many workers busy as are allowed until nothing waits any more."""
+    running: dict[Worker, Job] = {}
+    with stop_signals() as caught:
+        while waiting or running:
+            while waiting and len(running) < progress.n_workers and not caught:
+                job = waiting.pop(0)
+                running[executor.start(job, out)] = job
+            progress.running = [_running(job, out) for job in running.values()]
+            report(progress)
+            time.sleep(POLL_SECONDS)
+            if caught:
+                raise Stopped(caught[0])
+            for worker in [worker for worker in running if worker.poll() is not None]:
+                job = running.pop(worker)
+                record = _record_of(job, out)
+                if record is None:
+                    progress.failed.append(name_of(job))
+                    continue
+                _count(record, progress)
+                if record["status"] == "finished":
+                    progress.cpu_seconds.append(record["cpu_seconds"])
+    progress.running = []
+
+
+def _running(job: Job, out: str | Path) -> Running:
+    config = job.config
+    return Running(name_of(job), run_folder(config, job.seed, out), config.training.world_steps)
+
+
+def _record_of(job: Job, out: str | Path) -> dict[str, Any] | None:
+    """Return the record of a job's finished run, if there is one and it is the job's."""
     folder = run_folder(job.config, job.seed, out)
     if not (folder / "run.json").exists():
-        return False
+        return None
+    record = read_record(folder)
     # Both engines train the same policy, so that a run of either will do.
-    check_same_run(folder, job.config, job.seed, read_record(folder).get("engine", "native"))
-    return True
+    check_same_run(folder, job.config, job.seed, record.get("engine", "native"))
+    return record
 
 
-def _count(job: Job, out: str | Path, progress: Progress) -> None:
-    if read_record(run_folder(job.config, job.seed, out))["status"] == "diverged":
+def _count(record: dict[str, Any], progress: Progress) -> None:
+    if record["status"] == "diverged":
         progress.diverged += 1
     else:
         progress.done += 1
-
-
-def _start(job: Job, out: str | Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "marl_encircle", "train", *arguments(job), "--out", str(out), "--quiet"]
-    # A group of its own: Ctrl-C reaches the sweep alone, which then stops its workers in order.
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_die_with_parent
-    )
-
-
-def _die_with_parent() -> None:
-    """Have the kernel kill this process when the sweep is killed, so that the next sweep finds the folder free."""
-    if sys.platform == "linux":
-        pr_set_pdeathsig = 1
-        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
-
-
-def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
-    """Ask workers to write their checkpoints and end; kill those that do not."""
-    for process in processes:
-        process.send_signal(signal.SIGTERM)
-    deadline = time.monotonic() + GRACE_SECONDS
-    try:
-        for process in processes:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(max(0.0, deadline - time.monotonic()))
-    finally:  # also after a second Ctrl-C
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
-def _report(
-    progress: Progress, running: dict[subprocess.Popen[bytes], Job], report: Callable[[Progress], None] | None
-) -> None:
-    progress.running = [name_of(job) for job in running.values()]
-    if report is not None:
-        report(progress)

@@ -14,10 +14,10 @@ import pytest
 from tiny_runs import TINY, in_another_process
 
 from marl_encircle import locks
-from marl_encircle.experiments import sweep as sweeps
+from marl_encircle.experiments import executors
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import Setting, config_hash
-from marl_encircle.experiments.sweep import Progress, name_of, sweep
+from marl_encircle.experiments.sweep import Progress, Running, name_of, sweep
 from marl_encircle.experiments.train import OtherRunError, run_folder
 
 POPEN = subprocess.Popen
@@ -35,7 +35,7 @@ def made_up_worker(monkeypatch: pytest.MonkeyPatch, behave: str) -> None:
         script = f"import json, os, pathlib, signal, sys, time; seed = {seed}; folder = pathlib.Path({str(folder)!r})\n"
         return POPEN([sys.executable, "-I", "-S", "-c", script + behave], **options)
 
-    monkeypatch.setattr(sweeps.subprocess, "Popen", start)
+    monkeypatch.setattr(executors.subprocess, "Popen", start)
 
 
 def record_text(status: str = "finished") -> str:
@@ -48,6 +48,7 @@ def record_text(status: str = "finished") -> str:
             "config": config.to_dict(),
             "config_hash": config_hash(config.to_dict()),
             "engine": "native",
+            "cpu_seconds": 40.0,
             "sha256": {"policy.safetensors": "0" * 64},
         }
     )
@@ -104,6 +105,43 @@ def test_as_many_run_as_there_are_workers_and_every_change_is_reported(
     assert seen[0] == (0, 2, 1)
     assert seen[-1] == (3, 0, 0)
     assert all(done + running + left == 3 for done, running, left in seen)
+
+
+def test_time_is_left_for_what_the_workers_have_not_done_yet(tmp_path: Path) -> None:
+    # runs of 40 s (mean of 30 and 50): a quarter of a run is done, another has no curve yet, three have not begun
+    (tmp_path / "progress.csv").write_text("world_steps,success\n50,0.0\n100,0.5\n")
+    begun, new = Running("a", tmp_path, 400), Running("b", tmp_path / "none", 400)
+    assert (begun.world_steps, new.world_steps) == (100, 0)
+    progress = Progress(total=8, n_workers=2, done=3, running=[begun, new], cpu_seconds=[30.0, 50.0])
+    # first worker: 0.75 + 1 + 1, second: 1 + 1 runs
+    assert progress.seconds_left == 2.75 * 40
+    assert Progress(total=8, n_workers=9, done=4, running=[begun], cpu_seconds=[40.0]).seconds_left == 40.0
+    assert Progress(total=8, n_workers=2, done=4).seconds_left is None
+    assert Progress(total=8, done=4, diverged=1, failed=["a", "b", "c"]).seconds_left == 0.0
+
+
+def test_runs_of_this_sweep_alone_say_how_long_one_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_up_worker(monkeypatch, finish())
+    sweep(JOBS[:1], tmp_path, 1)
+    seen: list[tuple[int, float | None]] = []
+    made_up_worker(monkeypatch, finish())
+    sweep(JOBS, tmp_path, 5, lambda p: seen.append((p.done, p.seconds_left)))
+    assert seen[0] == (1, None)
+    assert seen[-1] == (3, 0.0)
+    seen.clear()
+    sweep(JOBS, tmp_path, 1, lambda p: seen.append((p.done, p.seconds_left)))
+    assert seen == [(3, 0.0)]
+
+
+def test_every_run_is_counted_once_whatever_becomes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    status = "status = ['finished', 'diverged'][seed == 1]\nseed == 2 and sys.exit(1)\n"
+    made_up_worker(monkeypatch, status + finish().replace("'seed': seed}", "'seed': seed, 'status': status}"))
+    seen: list[tuple[int, ...]] = []
+    progress = sweep(JOBS, tmp_path, 7, lambda p: seen.append(counts(p)))
+    assert counts(progress) == (1, 0, 1, 1, 0, 0)
+    assert all(done + diverged + failed + running + left == 3 for done, _, diverged, failed, running, left in seen)
+    assert all(n >= 0 for state in seen for n in state)
+    assert progress.cpu_seconds == [40.0]
 
 
 def test_a_run_of_another_configuration_is_refused_before_anything_starts(
@@ -193,7 +231,7 @@ def test_a_worker_trains_the_job_it_is_given(tmp_path: Path, monkeypatch: pytest
         changes = [part for text in TINY for part in ("--set", text)]
         return POPEN([*command, *changes], **options)
 
-    monkeypatch.setattr(sweeps.subprocess, "Popen", start)
+    monkeypatch.setattr(executors.subprocess, "Popen", start)
     # tiny as its worker makes it, it is not the job's run any more, and that is noticed too
     with pytest.raises(OtherRunError, match=r"training\.n_worlds: 16 here, 4 there"):
         sweep(JOBS[:1], tmp_path, 1)
