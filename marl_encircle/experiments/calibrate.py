@@ -22,8 +22,8 @@ from pydantic import Field, ValidationError
 
 from marl_encircle import files
 from marl_encircle.experiments.config import Profile, Section, check_seed, explain
-from marl_encircle.experiments.grid import Job, SettingConfig
-from marl_encircle.experiments.library import PACKAGE, find_file
+from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
+from marl_encircle.experiments.library import find_plan
 from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.paper import paper_results
 from marl_encircle.experiments.records import Cell, Setting, read_runs
@@ -91,7 +91,7 @@ def load_protocol(name: str) -> Protocol:
     :param name: a name in ``configs/paper/`` or the path of a YAML file
     :raises ConfigError: naming file and key
     """
-    path = find_file(name, [PACKAGE / "configs" / "paper"], "protocol")
+    path = find_plan(name, "protocol")
     try:
         protocol = Protocol(**read_yaml(path))
     except ValidationError as error:
@@ -102,9 +102,30 @@ def load_protocol(name: str) -> Protocol:
     for cell in protocol.cells:
         if cell not in paper_cells():
             raise ConfigError(f"{path}: the paper has no numbers of {cell.method} in {cell.setting}")
-    for changes in ({}, *protocol.neighbours):
-        _jobs(protocol, changes)
+    with naming_file(path):
+        _check_distinct(protocol)
     return protocol
+
+
+def _check_distinct(protocol: Protocol) -> None:
+    """Refuse what would be trained or counted twice, and a neighbour that is in another cell of the paper.
+
+    :raises ConfigError: naming the key
+    """
+    for key, values in (("seeds", protocol.seeds), ("settings", protocol.cells)):
+        for i, value in enumerate(values):
+            if value in values[:i]:
+                raise ConfigError(f"{key}.{i}: stands there twice; got {getattr(protocol, key)[i]!r:.80}")
+    configs = [[job.config for job in _jobs(protocol, {})]]
+    for i, changes in enumerate(protocol.neighbours):
+        for name in changes:
+            if name in Setting._fields:
+                raise ConfigError(f"neighbours.{i}.{name}: belongs to the settings; a neighbour moves another field")
+        configs.append([job.config for job in _jobs(protocol, changes)])
+        same = configs.index(configs[-1])
+        if same <= i:
+            other = f"neighbours.{same - 1}" if same else "the centre"
+            raise ConfigError(f"neighbours.{i}: {name_of(changes)} is the same scenario as {other}")
 
 
 def calibrate(

@@ -1,6 +1,9 @@
 """A grid file -> the runs it asks for: methods x settings x seeds."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
@@ -10,10 +13,11 @@ from marl_encircle.experiments.config import (
     Profile,
     Section,
     check_seed,
+    difference,
     explain,
     load_config,
 )
-from marl_encircle.experiments.library import PACKAGE, find_file, is_path
+from marl_encircle.experiments.library import find_plan, is_path
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
@@ -30,10 +34,10 @@ class SettingConfig(Section):
 class Group(Section):
     """Every method in every setting with every seed."""
 
-    methods: list[str]
+    methods: Annotated[list[str], Field(min_length=1)]
     algorithm: str = "maddpg"
-    settings: list[SettingConfig]
-    seeds: list[Annotated[int, Field(ge=0, lt=1 << 32)]]
+    settings: Annotated[list[SettingConfig], Field(min_length=1)]
+    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=1 << 32)]], Field(min_length=1)]
 
 
 class Shared(Section):
@@ -53,7 +57,7 @@ class GridConfig(Section):
     profile: Profile
     scenario: str = "default"
     frozen: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
-    groups: list[Group]
+    groups: Annotated[list[Group], Field(min_length=1)]
     shared: list[Shared]
 
 
@@ -107,7 +111,7 @@ def load_grid(name: str) -> Grid:
     :raises ConfigError: naming file and key; all configurations are checked too
     """
     _config.cache_clear()
-    path = find_file(name, [PACKAGE / "configs" / "paper"], "grid")
+    path = find_plan(name, "grid")
     try:
         grid = GridConfig(**read_yaml(path))
     except ValidationError as error:
@@ -117,32 +121,55 @@ def load_grid(name: str) -> Grid:
         return str(path.parent / name) if is_path(name) else name
 
     jobs: dict[Job, None] = {}
+    owners: dict[Cell, Job] = {}
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
         for method in map(beside, group.methods):
             for setting in (Setting(**column.model_dump()) for column in group.settings):
                 first = Job(method, setting, 0, grid.profile, beside(grid.scenario), beside(group.algorithm))
-                config = first.config
-                try:
+                with naming_file(path):
+                    config = first.config
                     for seed in group.seeds:
                         check_seed(config, seed)
-                except ConfigError as error:
-                    raise ConfigError(f"{path}: {error}") from error
                 cell = config.cell
                 owner = _owner(cell, grid.shared)
                 if owner is not None:
                     aliases[cell] = Cell(owner, setting)
                     continue
-                jobs |= dict.fromkeys(first._replace(seed=seed) for seed in group.seeds)
-    owners: dict[Cell, str] = {}
-    for job in jobs:
-        reward = owners.setdefault(job.config.cell, job.reward)
-        if reward != job.reward:
-            raise ConfigError(f"{path}: {reward} and {job.reward} have the same method name, {job.config.reward.name}")
+                earlier = owners.setdefault(cell, first)
+                with naming_file(path):
+                    _check_same(earlier, first)
+                jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
     return Grid(tuple(jobs), aliases, grid.frozen)
+
+
+@contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Put the file that asks for a configuration in front of what is wrong with it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError("\n".join(f"{path}: {line}" for line in str(error).splitlines())) from error
+
+
+def _check_same(earlier: Job, later: Job) -> None:
+    """Refuse two jobs of one cell that are not one training: their runs would have one folder and one mean.
+
+    :raises ConfigError: with the first key that differs
+    """
+    method, setting = earlier.config.cell
+    if earlier.reward != later.reward:
+        raise ConfigError(f"{earlier.reward} and {later.reward} have the same method name, {method}")
+    lines = difference(earlier.config.to_dict(), later.config.to_dict(), ("first", "then"))
+    if lines:
+        where = f"ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
+        raise ConfigError(
+            f"{method} at {where} is asked for with two configurations: {lines[0]}; the method of one of them needs "
+            "another name"
+        )
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

@@ -7,12 +7,15 @@
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from marl_encircle.core.rewards import nearest
 from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, read_yaml
 
 PACKAGE = Path(__file__).parent.parent
+
+PROTOCOLS = ("calibration",)
+"""Files of ``configs/paper/`` that are protocols; the others are grids."""
 
 MAX_BASES = 20
 
@@ -59,9 +62,22 @@ def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
 
     :raises ConfigError: naming the nearest name
     """
+    return _choose(name, (path for folder in folders for path in folder.glob("*.yaml")), kind)
+
+
+def find_plan(name: str, kind: Literal["grid", "protocol"]) -> Path:
+    """Return the file of that name in ``configs/paper/``, where grids and protocols lie, or of that path.
+
+    :raises ConfigError: naming the nearest name of that kind
+    """
+    paths = (PACKAGE / "configs" / "paper").glob("*.yaml")
+    return _choose(name, (path for path in paths if (path.stem in PROTOCOLS) == (kind == "protocol")), kind)
+
+
+def _choose(name: str, paths: Iterable[Path], kind: str) -> Path:
     if is_path(name):
         return Path(name)
-    known = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
+    known = {path.stem: path for path in paths}
     if name not in known:
         raise ConfigError(f"{kind} {name!r:.80}: neither a known name nor a .yaml path{nearest(name, known)}")
     return known[name]

@@ -135,6 +135,12 @@ def test_the_projects_protocol_is_allowed_and_holds_the_other_cells_out() -> Non
     assert len(protocol.seeds) == 2
 
 
+def test_a_grid_is_no_protocol() -> None:
+    for name in ("all", "calibratio"):
+        with pytest.raises(ConfigError, match=r"neither a known name.*(known: calibration$|mean calibration\?)"):
+            load_protocol(name)
+
+
 def test_the_papers_cells_are_those_with_numbers() -> None:
     cells = paper_cells()
     assert cells[Cell("ours", Setting(1.1, 2, 1))] == Result(77.75, 29.48)
@@ -153,6 +159,18 @@ def test_the_papers_cells_are_those_with_numbers() -> None:
         ("seeds: [910]", "seeds: []", "seeds"),
         ("seeds: [910]", "seeds: [1000]", "seed must differ from evaluation.seed"),
         ("seeds: [910]", "seed: [910]", "did you mean seeds"),
+        ("seeds: [910]", "seeds: [910, 911, 910]", "seeds.2: stands there twice; got 910"),
+        ("{contacts: hard}", "{pursuers: 4}", "neighbours.1.pursuers: belongs to the settings"),
+        ("{contacts: hard}", "{obstacles: 1}", "neighbours.1.obstacles: belongs to the settings"),
+        ("{contacts: hard}", "{speed_ratio: 1.2}", "neighbours.1.speed_ratio: belongs to the settings"),
+        ("{contacts: hard}", "{scene: tunnel}", "neighbours.1.scene: belongs to the settings"),
+        ("{contacts: hard}", "{contacts: soft}", "neighbours.1: contacts=soft is the same scenario as the centre"),
+        ("{contacts: hard}", "{acceleration: 3.0}", "neighbours.1: acceleration=3.0 is the same .* as neighbours.0"),
+        (
+            "obstacles: 0}",
+            "obstacles: 0}\n  - {speed_ratio: 1.1, pursuers: 3, obstacles: 0}",
+            "settings.1: stands there twice",
+        ),
     ],
 )
 def test_a_protocol_that_cannot_be_carried_out_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:

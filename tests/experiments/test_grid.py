@@ -102,6 +102,41 @@ def test_two_methods_of_one_name_are_refused(tmp_path: Path) -> None:
         grid_of(tmp_path, GRID.format(method="ours.yaml"))
 
 
+TWO_ALGORITHMS = """profile: smoke
+groups:
+  - {{methods: [ours], algorithm: {first}, settings: [{setting}], seeds: [0, 1]}}
+  - {{methods: [ours], algorithm: {second}, settings: [{setting}], seeds: [1, 2]}}
+shared: []
+"""
+
+
+@pytest.mark.parametrize("seeds", ["[1, 2]", "[2]"])
+def test_one_cell_with_two_configurations_is_refused(tmp_path: Path, seeds: str) -> None:
+    text = TWO_ALGORITHMS.format(first="maddpg", second="matd3", setting=SETTING).replace("[1, 2]", seeds)
+    with pytest.raises(ConfigError) as caught:
+        grid_of(tmp_path, text)
+    assert str(caught.value) == (
+        f"{tmp_path}/grid.yaml: ours at ratio 1.1, n=3, m=1, random is asked for with two configurations: "
+        "algorithm.name: maddpg first, matd3 then; the method of one of them needs another name"
+    )
+
+
+def test_one_training_under_two_names_is_one_run(tmp_path: Path) -> None:
+    (tmp_path / "same.yaml").write_text("base: maddpg\n")
+    grid = grid_of(tmp_path, TWO_ALGORITHMS.format(first="maddpg", second="same.yaml", setting=SETTING))
+    assert [(job.algorithm, job.seed) for job in grid.jobs] == [("maddpg", 0), ("maddpg", 1), ("maddpg", 2)]
+
+
+def test_what_is_wrong_with_a_method_is_told_with_the_grid_that_asks_for_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        grid_of(tmp_path, GRID.format(method="our"))
+    assert str(caught.value).startswith(f"{tmp_path}/grid.yaml: reward 'our': neither a known name")
+    (tmp_path / "mine.yaml").write_text("base: ours\nscales: 1.0\n")
+    with pytest.raises(ConfigError) as caught:
+        grid_of(tmp_path, GRID.format(method="mine.yaml"))
+    assert str(caught.value).startswith(f"{tmp_path}/grid.yaml: {tmp_path}/mine.yaml: reward.scales: unknown key")
+
+
 SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
 
 
@@ -122,6 +157,9 @@ SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
         ("[2, 3, 2]", "[4294967296]", "groups.0.seeds.0: input should be less than 4294967296"),
         ("[2, 3, 2]", "[true]", "groups.0.seeds.0: input should be a valid integer; got True"),
         ("[2, 3, 2]", "3", "groups.0.seeds: input should be a valid list; got 3"),
+        ("[ours, ours]", "[]", "groups.0.methods: list should have at least 1 item"),
+        ("[2, 3, 2]", "[]", "groups.0.seeds: list should have at least 1 item"),
+        (f"[{SETTING}]", "[]", "groups.0.settings: list should have at least 1 item"),
         ("[ours, ours]", "[ours, our]", "reward 'our': neither a known name nor a .yaml path; did you mean ours?"),
         ("shared: []", f"shared: []\nfrozen: {COMMIT[1:]}", "frozen: string should match pattern"),
         ("shared: []", f"shared: []\nfrozen: {COMMIT.upper()}", "frozen: string should match pattern"),
@@ -144,7 +182,20 @@ def test_a_seed_of_the_evaluation_is_refused(tmp_path: Path) -> None:
         grid_of(tmp_path, GRID.format(method="ours").replace("[2, 3, 2]", "[2, 1000]"))
 
 
-@pytest.mark.parametrize(("name", "reason"), [("al", "did you mean all?"), ("absent.yaml", "No such file")])
+def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"grid\.yaml: groups: list should have at least 1 item"):
+        grid_of(tmp_path, "profile: smoke\ngroups: []\nshared: []\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("al", "did you mean all?"),
+        ("nope", "known: all, committed, smoke"),
+        ("calibration", "known: all, committed, smoke"),
+        ("absent.yaml", "No such file"),
+    ],
+)
 def test_a_grid_that_is_not_there_is_refused(name: str, reason: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_grid(name)

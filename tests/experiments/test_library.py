@@ -1,11 +1,12 @@
 """A name is a file of the installation or a path; a file says only what differs from its base."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from marl_encircle.experiments.library import find_file, load_reward, load_section, reward_names
-from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.experiments.library import PACKAGE, find_file, find_plan, load_reward, load_section, reward_names
+from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 
 def write(folder: Path, name: str, text: str) -> str:
@@ -33,6 +34,14 @@ def test_a_name_is_looked_up_in_every_folder_and_a_path_in_none(tmp_path: Path) 
     assert find_file("first.yaml", folders, "grid") == Path("first.yaml")
     with pytest.raises(ConfigError, match=r"grid 'second2': neither a known name .*did you mean second"):
         find_file("second2", folders, "grid")
+
+
+def test_every_plan_of_the_package_is_of_its_kind() -> None:
+    for path in (PACKAGE / "configs" / "paper").glob("*.yaml"):
+        kind: Any = "protocol" if "neighbours" in read_yaml(path) else "grid"
+        assert find_plan(path.stem, kind) == path
+        with pytest.raises(ConfigError, match="neither a known name"):
+            find_plan(path.stem, "grid" if kind == "protocol" else "protocol")
 
 
 def test_a_chain_of_bases_is_followed_from_file_to_file(tmp_path: Path) -> None:
