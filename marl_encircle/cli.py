@@ -47,12 +47,23 @@ app = typer.Typer(
 config_app = typer.Typer(no_args_is_help=True, help="Show, compare and check configurations.")
 app.add_typer(config_app, name="config")
 
-Reward = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
-SpeedRatio = Annotated[float, typer.Option(help="Target speed / pursuer speed.")]
-Pursuers = Annotated[int, typer.Option(help="Number of pursuers.")]
-Obstacles = Annotated[int, typer.Option(help="Number of obstacles.")]
-Scene = Annotated[str, typer.Option(help="What an obstacle looks like: random, concave or tunnel.")]
-Scenario = Annotated[str, typer.Option(help="The world's rules: default, paper, or the path of a YAML file.")]
+RewardOption = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
+ScenarioOption = Annotated[str, typer.Option(help="The world's rules: default, or the path of a YAML file.")]
+# Those that are not given are the scenario's own.
+SpeedRatio = Annotated[
+    float | None, typer.Option(help="Target speed / pursuer speed.", show_default="the scenario's; 1.1 in default")
+]
+Pursuers = Annotated[int | None, typer.Option(help="Number of pursuers.", show_default="the scenario's; 3 in default")]
+Obstacles = Annotated[
+    int | None, typer.Option(help="Number of obstacles.", show_default="the scenario's; 1 in default")
+]
+Scene = Annotated[
+    str | None,
+    typer.Option(
+        help="What an obstacle looks like: random, concave or tunnel.",
+        show_default="the scenario's; random in default",
+    ),
+]
 Algorithm = Annotated[str, typer.Option(help="maddpg, matd3, or the path of a YAML file.")]
 ProfileOption = Annotated[Profile, typer.Option(help="full, or smoke for a few seconds.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override: section.key=value. May be repeated.")]
@@ -93,13 +104,13 @@ def _options(
 
 @app.command("train")
 def train_command(
-    reward: Reward = "ours",
-    speed_ratio: SpeedRatio = 1.1,
-    pursuers: Pursuers = 3,
-    obstacles: Obstacles = 1,
-    scene: Scene = "random",
+    reward: RewardOption = "ours",
+    speed_ratio: SpeedRatio = None,
+    pursuers: Pursuers = None,
+    obstacles: Obstacles = None,
+    scene: Scene = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Training seed.")] = 0,
-    scenario: Scenario = "default",
+    scenario: ScenarioOption = "default",
     algorithm: Algorithm = "maddpg",
     engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
     profile: ProfileOption = "full",
@@ -253,10 +264,23 @@ def figures(
     out: Results = Path("results"),
 ) -> None:
     """Draw Figures 1 and 3 to 6 from the runs there are."""
-    from marl_encircle.experiments.figures.write import write_figures
-
+    try:
+        from marl_encircle.experiments.figures.write import write_figures
+    except ImportError as error:
+        raise ConfigError(str(error)) from error
     for path in write_figures(load_grid(grid), out):
         typer.echo(str(path))
+
+
+@app.command("report")
+def report_command(
+    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
+    out: Results = Path("results"),
+) -> None:
+    """Write report.html: tables, learning curves and a player of evaluation rounds, in one file that needs no network."""
+    from marl_encircle.experiments.report.write import write_report
+
+    typer.echo(str(write_report(load_grid(grid), out)))
 
 
 @app.command("reproduce-tables")
@@ -286,11 +310,15 @@ def verify_results(
     """Play every committed policy's rounds again, render its tables again, and compare. Nothing is written.
 
     On the processor that a run was made on every round must be equal; elsewhere 99.5 % of the rounds, and every cell's
-    S must lie within its 99 % binomial interval. Exit code 3 where that does not hold.
+    S must lie within its 99 % binomial interval. Exit code 3 where that does not hold, and where there is no finished
+    run.
     """
     with tqdm(unit="run", disable=quiet) as bar:
         found = verify(load_grid(grid), out, lambda done, total: _advance(bar, done, total))
     check = "every figure of every round" if found.exact else "how the rounds end: another processor than the runs'"
+    if not found.rounds:
+        typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
+        raise typer.Exit(3)
     typer.echo(f"check: {check}")
     for name in found.changed:
         typer.echo(f"changed: {out / name}")
@@ -310,12 +338,12 @@ def bench() -> None:
 
 @config_app.command("show")
 def config_show(
-    reward: Reward = "ours",
-    speed_ratio: SpeedRatio = 1.1,
-    pursuers: Pursuers = 3,
-    obstacles: Obstacles = 1,
-    scene: Scene = "random",
-    scenario: Scenario = "default",
+    reward: RewardOption = "ours",
+    speed_ratio: SpeedRatio = None,
+    pursuers: Pursuers = None,
+    obstacles: Obstacles = None,
+    scene: Scene = None,
+    scenario: ScenarioOption = "default",
     algorithm: Algorithm = "maddpg",
     profile: ProfileOption = "full",
     overrides: Set = None,
@@ -356,16 +384,17 @@ def config_validate(path: Annotated[str, typer.Argument(help="A method's name or
 
 def _config(
     reward: str,
-    speed_ratio: float,
-    pursuers: int,
-    obstacles: int,
-    scene: str,
+    speed_ratio: float | None,
+    pursuers: int | None,
+    obstacles: int | None,
+    scene: str | None,
     scenario: str,
     algorithm: str,
     profile: Profile,
     overrides: list[str] | None,
 ) -> Config:
-    fields = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
+    given = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
+    fields = {name: value for name, value in given.items() if value is not None}
     return load_config(
         reward, algorithm=algorithm, profile=profile, scenario=scenario, fields=fields, overrides=overrides or ()
     )

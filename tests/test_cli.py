@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from stable_baselines3.common import logger
 from tiny_runs import (
     TINY,
     Done,
@@ -315,6 +316,77 @@ def test_a_damaged_run_ends_with_3_and_its_reason(
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--episodes", "10000001"], ["--seed", "-1"]])
 def test_a_bad_number_of_rounds_ends_with_2(run: Run, arguments: list[str]) -> None:
     assert run("evaluate", finished(), *arguments).code == 2
+
+
+# scenarios
+
+
+def test_what_no_option_says_is_the_scenarios(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("speed_ratio: 1.3\npursuers: 4\nobstacles: 2\nscene: concave\n")
+    shown = json.loads(run("config", "show", "--scenario", path, "--json").out)["scenario"]
+    assert [shown[key] for key in ("speed_ratio", "pursuers", "obstacles", "scene")] == [1.3, 4, 2, "concave"]
+    shown = json.loads(run("config", "show", "--scenario", path, "--pursuers", "5", "--json").out)["scenario"]
+    assert [shown[key] for key in ("speed_ratio", "pursuers")] == [1.3, 5]
+    shown = json.loads(run("config", "show", "--json").out)["scenario"]
+    assert [shown[key] for key in ("speed_ratio", "pursuers", "obstacles", "scene")] == [1.1, 3, 1, "random"]
+
+
+def test_train_takes_the_scenarios_own_setting(run: Run, runs: Path, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("pursuers: 4\nobstacles: 0\n")
+    arguments = tiny_arguments("--out", str(runs), "--quiet", "--no-tensorboard", "--scenario", str(path))
+    done = run("train", *arguments)
+    assert done.out == f"{runs}/ours/ratio1.1_n4_m0_random/seed0\n"
+
+
+@pytest.mark.parametrize("name", ["train", "config show"])
+def test_a_scenario_that_is_wrong_ends_with_2_by_file_and_key(run: Run, tmp_path: Path, name: str) -> None:
+    path = tmp_path / "mine.yaml"
+    for text, reason in (("speed_ratio: 0.3", "speed_ratio must be between"), ("pursuer: 3", "pursuer: unknown key")):
+        path.write_text(text)
+        for more in ((), ("--speed-ratio", "1.2")):
+            done = run(*name.split(), "--scenario", path, *more)
+            assert (done.code, done.out) == (2, "")
+            assert done.err.startswith(f"error: {path}: scenario.{reason}")
+
+
+def test_a_scene_that_is_full_at_the_curriculums_usual_start_can_be_shown(run: Run) -> None:
+    done = run("config", "show", "--pursuers", "2", "--obstacles", "4", "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["training"]["curriculum"]["obstacle_radius"]["start"] == 0.279
+
+
+# optional parts
+
+
+def test_train_without_tensorboard_ends_with_2_and_leaves_nothing(
+    run: Run, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logger, "SummaryWriter", None)
+    done = run("train", *tiny_arguments("--out", str(runs), "--quiet"))
+    assert (done.code, runs.exists()) == (2, False)
+    assert "--no-tensorboard" in done.err
+    assert "Traceback" not in done.err
+
+
+def test_figures_without_matplotlib_end_with_2_and_what_to_install(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("marl_encircle.experiments.figures")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    before = everything_in(tmp_path)
+    done = run("figures", "--grid", "smoke")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "error: figures need Matplotlib: pip install 'matplotlib>=3.9'\n"
+    assert everything_in(tmp_path) == before
+
+
+def test_verification_of_nothing_ends_with_3(run: Run, tmp_path: Path) -> None:
+    done = run("verify-results", "--grid", "smoke", "--out", tmp_path, "--quiet")
+    assert (done.code, done.out) == (3, "")
+    assert done.err == f"nothing was verified: {tmp_path}/runs has no finished run of the grid smoke\n"
 
 
 # sweep, tables, reproduce-tables

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch as th
+from stable_baselines3.common import logger
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, configure
 
@@ -85,6 +86,11 @@ def train(
         return folder, False
     plan = _plan(config, seed, engine)
     check_training(config)
+    if tensorboard and getattr(logger, "SummaryWriter", None) is None:  # as SB3 says that it cannot import it
+        raise ConfigError(
+            "event files need TensorBoard, which cannot be imported: pip install 'tensorboard>=2.18', or train without "
+            "them (--no-tensorboard)"
+        )
     _check_placement(config)
     with locks.folder_lock(folder):
         if (folder / "run.json").exists():  # by whoever had the lock until now

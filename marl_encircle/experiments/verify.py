@@ -42,9 +42,9 @@ class Verification(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the results are those of this code."""
+        """Whether there are results and they are those of this code."""
         enough = self.equal == self.rounds if self.exact else self.equal >= EQUAL_SHARE * self.rounds
-        return enough and not self.cells_off and not self.changed
+        return self.rounds > 0 and enough and not self.cells_off and not self.changed
 
 
 def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] | None = None) -> Verification:

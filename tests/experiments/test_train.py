@@ -17,6 +17,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common import logger
 from tiny_runs import (
     FILES,
     TINY,
@@ -86,6 +87,15 @@ def test_the_rounds_are_those_of_the_evaluation_section() -> None:
 def test_the_tables_read_what_the_training_wrote() -> None:
     (run,) = read_runs(finished().parents[2])
     assert (run.cell, run.seed, run.status, run.closure) == (tiny().cell, 0, "finished", "all")
+
+
+def test_event_files_without_tensorboard_are_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logger, "SummaryWriter", None)
+    with pytest.raises(ConfigError, match=r"pip install 'tensorboard>=2\.18', or train without .*--no-tensorboard"):
+        train.train(tiny(), 0, "native", tmp_path, tensorboard=True)
+    assert everything_in(tmp_path) == []
 
 
 # again, and another one

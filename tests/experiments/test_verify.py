@@ -76,6 +76,13 @@ def test_a_table_that_the_runs_do_not_give_is_found(results: Path) -> None:
     assert not found.passed
 
 
+def test_nothing_is_no_proof(tmp_path: Path) -> None:
+    write_tables(GRID, tmp_path)
+    found = verify(GRID, tmp_path)
+    assert (found.rounds, found.changed) == (0, ())
+    assert not found.passed
+
+
 def test_a_cell_is_off_outside_the_99_percent_binomial_interval() -> None:
     """S = 90 % of 1,000 rounds: Wilson's interval is 87.29 to 92.18 %."""
     recorded = [True] * 900 + [False] * 100
