@@ -77,8 +77,8 @@ evaluate: $(READY)  ## fresh rounds of that run (trained first if it is missing)
 sweep: $(READY)  ## train and evaluate what is missing of GRID: GRID JOBS RESULTS
 	$(CLI) sweep $(GRID) --jobs $(JOBS) --out $(RESULTS)/runs
 
-tables: $(READY)  ## render the tables from the runs there are: RESULTS
-	$(CLI) tables --out $(RESULTS)
+tables: $(READY)  ## render the tables from the runs there are: GRID RESULTS
+	$(CLI) tables --grid $(GRID) --out $(RESULTS)
 
 figures: $(READY)  ## draw the figures from the runs there are: GRID RESULTS
 	$(CLI) figures --grid $(GRID) --out $(RESULTS)

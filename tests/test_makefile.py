@@ -52,5 +52,8 @@ def test_variables_reach_the_command() -> None:
     shown = " ".join(make("-n", "evaluate", "SPEED_RATIO=1.10", "RESULTS=elsewhere").split())
     assert "--speed-ratio 1.10" in shown  # the command knows where that run lies
     assert shown.endswith('--out elsewhere/runs | tail -n 1)"')
+    for target in ("tables", "figures", "verify-results"):
+        shown = make("-n", target, "GRID=smoke", "RESULTS=elsewhere")
+        assert shown.strip().endswith(f"{target} --grid smoke --out elsewhere")
     shown = make("-n", "reproduce-tables", "GRID=smoke", "RESULTS=elsewhere", "JOBS=3")
     assert shown.strip().endswith("reproduce-tables --grid smoke --out elsewhere --jobs 3")
