@@ -48,7 +48,9 @@ config_app = typer.Typer(no_args_is_help=True, help="Show, compare and check con
 app.add_typer(config_app, name="config")
 
 RewardOption = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
-ScenarioOption = Annotated[str, typer.Option(help="The world's rules: default, or the path of a YAML file.")]
+ScenarioOption = Annotated[
+    str, typer.Option(help="The world's rules: a name such as default, or the path of a YAML file.")
+]
 # Those that are not given are the scenario's own.
 SpeedRatio = Annotated[
     float | None, typer.Option(help="Target speed / pursuer speed.", show_default="the scenario's; 1.1 in default")
@@ -277,7 +279,7 @@ def report_command(
     grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
     out: Results = Path("results"),
 ) -> None:
-    """Write report.html: tables, learning curves and a player of evaluation rounds, in one file that needs no network."""
+    """Write report.html: tables, learning curves and a player of rounds, in one file that needs no network."""
     from marl_encircle.experiments.report.write import write_report
 
     typer.echo(str(write_report(load_grid(grid), out)))

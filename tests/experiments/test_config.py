@@ -344,8 +344,8 @@ def test_what_is_wrong_is_told_with_the_file_that_says_it(tmp_path: Path) -> Non
 
 
 def test_a_scenarios_file_is_told_also_where_a_change_would_hide_its_fault(tmp_path: Path) -> None:
-    path = write(tmp_path, "mine.yaml", "aceleration: 3\n")
-    assert refused(scenario=path) == f"{path}: scenario.aceleration: unknown key; did you mean acceleration?"
+    path = write(tmp_path, "mine.yaml", "accelerat: 3\n")
+    assert refused(scenario=path) == f"{path}: scenario.accelerat: unknown key; did you mean acceleration?"
     path = write(tmp_path, "mine.yaml", "speed_ratio: 0.3\n")
     for changes in ({}, {"speed_ratio": 1.2}):
         assert refused(scenario=path, fields=changes).startswith(f"{path}: scenario.speed_ratio must be between")
