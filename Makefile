@@ -2,6 +2,7 @@
 
 BASE_PYTHON ?= python3
 PIP_ARGS    ?=
+EXTRAS      ?= dev
 PYTEST_ARGS ?=
 
 REWARD      ?= ours
@@ -35,11 +36,11 @@ help:  ## list the targets and the variables
 	      "SCENE=$(SCENE) SEED=$(SEED)"
 	@echo "  JOBS=$(JOBS) GRID=$(GRID) RESULTS=$(RESULTS) PIP_ARGS=$(PIP_ARGS) PYTEST_ARGS=$(PYTEST_ARGS)"
 
-setup: $(READY)  ## make .venv with the versions of constraints.txt (PIP_ARGS goes to pip)
+setup: $(READY)  ## make .venv with the versions of constraints.txt: EXTRAS, PIP_ARGS for pip
 
 $(READY): pyproject.toml constraints.txt
 	$(BASE_PYTHON) -m venv .venv
-	$(PYTHON) -m pip install $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+	$(PYTHON) -m pip install $(PIP_ARGS) -c constraints.txt -e '.[$(EXTRAS)]'
 	@touch $@
 
 test: $(READY)  ## the tests (PYTEST_ARGS goes to pytest)

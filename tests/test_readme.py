@@ -7,8 +7,6 @@ They are printed by
 
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 BEGIN, END = "<!-- tables -->\n", "<!-- /tables -->\n"
 
@@ -22,8 +20,6 @@ def without_notes(text: str) -> str:
 
 def test_the_readme_shows_tables_2_to_4_as_rendered() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    if BEGIN not in readme:
-        pytest.skip("the README has no tables yet")
     tables = [(ROOT / "results" / "tables" / f"table{number}.md").read_text(encoding="utf-8") for number in (2, 3, 4)]
     shown = readme.partition(BEGIN)[2].partition(END)[0]
     assert shown == "\n" + "".join(map(without_notes, tables))

@@ -57,10 +57,9 @@ def test_a_committed_round_is_played_as_it_was_recorded(run: str) -> None:
     evaluation = config.evaluation
     numbers = [0, 1, 42, 99, 100, len(rounds) - 1]
     played = play_rounds(policy, config, len(rounds), evaluation.seed)
-    if any(steps(played[number]) != steps(rounds[number]) for number in numbers):
-        pytest.skip("this processor rounds otherwise than the one that evaluated the run")
-    for number in numbers:
-        assert steps(record_round(policy, config, number, evaluation.seed)) == steps(rounds[number])
+    for number in numbers:  # on another processor a round may end otherwise than it did when it was recorded
+        assert steps(record_round(policy, config, number, evaluation.seed)) == steps(played[number])
+    assert sum(steps(played[number]) == steps(rounds[number]) for number in range(len(rounds))) >= 0.98 * len(rounds)
 
 
 def test_contributing_angles_of_all_steps_give_the_recorded_spread() -> None:
