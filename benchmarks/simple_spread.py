@@ -1,8 +1,9 @@
 """Train MADDPG on MPE2's ``simple_spread_v3`` through SuperSuit, and parameter-shared TD3 beside it.
 
 Both learn from the same number of world-steps with the same number of updates on one core, and play the same fresh
-rounds afterwards, as do random actions. MADDPG has one actor for all agents too, and a critic for each. TD3 is Stable-Baselines3's: one policy for every agent's slot, each slot an
-environment of its own. The hyper-parameters were chosen for either in short trainings with seed 100.
+rounds afterwards, as do random actions. MADDPG has one actor for all agents, and a critic for each. TD3 is
+Stable-Baselines3's: one policy for every agent's slot, each slot an environment of its own. The hyper-parameters were
+chosen for either in short trainings with seed 100.
 
 Finished trainings are kept in the result's file: a run that was interrupted goes on with those that are missing.
 

@@ -213,19 +213,19 @@ success_high mean_episode_length success_all success_pursuers sigma_c policy_sha
 def test_evaluate_prints_one_object_and_reads_only(run: Run) -> None:
     folder = finished()
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
-    done = run("evaluate", folder, "--episodes", "30", "--seed", "77", "--json")
+    done = run("evaluate", folder, "--episodes", "200", "--seed", "77", "--json")
     assert done.code == 0
     result = json.loads(done.out)
     assert list(result) == KEYS
-    assert [result[key] for key in KEYS[:9]] == ["ours", 1.1, 3, 1, "random", 0, 77, 30, "all"]
+    assert [result[key] for key in KEYS[:9]] == ["ours", 1.1, 3, 1, "random", 0, 77, 200, "all"]
     assert result["success"] == result["success_all"] >= result["success_pursuers"]
     assert 0 < result["success"] < 1
-    low, high = wilson_interval(result["success"], 30)
+    low, high = wilson_interval(result["success"], 200)
     assert (result["success_low"], result["success_high"]) == pytest.approx((low, high))
     assert result["policy_sha256"] == files.sha256_file(folder / "policy.safetensors")
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
-    assert run("evaluate", folder, "--episodes", "30", "--seed", "77", "--json") == done
-    text = run("evaluate", folder, "--episodes", "30", "--seed", "77").out
+    assert run("evaluate", folder, "--episodes", "200", "--seed", "77", "--json") == done
+    text = run("evaluate", folder, "--episodes", "200", "--seed", "77").out
     assert [line.split()[0] for line in text.splitlines()] == KEYS
 
 

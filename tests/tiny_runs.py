@@ -37,7 +37,7 @@ TINY = (
     "evaluation.curve_episodes=4",
     "evaluation.n_directions=72",
     "scenario.max_cycles=20",  # whose clumsy pursuers succeed now and then:
-    "scenario.movement_range_limit=0.6",
+    "scenario.movement_range_limit=2.0",
 )
 FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
 

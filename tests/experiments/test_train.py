@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -30,7 +29,6 @@ from tiny_runs import (
     tiny_arguments,
     train_slowly,
 )
-from torch.nn import functional
 
 from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
@@ -441,19 +439,22 @@ def test_a_diverged_training_is_kept_and_shown(
     update = when + 1 - 15  # random actions come first
     if what == "loss":
         calls = itertools.count(1)
-        mse_loss = functional.mse_loss
-        late = SimpleNamespace(mse_loss=lambda *a, **k: mse_loss(*a, **k) * (1 if next(calls) < update else th.nan))
-        monkeypatch.setattr(maddpg, "functional", late)
-    else:
-        optimize = MADDPG._optimize
+        gradients = maddpg.critic_gradients
 
-        def diverging(self: MADDPG, network: Any, loss: th.Tensor) -> None:
-            optimize(self, network, loss)
+        def late(*arguments: Any) -> th.Tensor:
+            return gradients(*arguments) * (1 if next(calls) < update else th.nan)
+
+        monkeypatch.setattr(maddpg, "critic_gradients", late)
+    else:
+        step = MADDPG._step
+
+        def diverging(self: MADDPG, network: Any) -> None:
+            step(self, network)
             if self._n_updates >= update:
                 with th.no_grad():
                     next(self.actor.parameters()).fill_(th.inf)
 
-        monkeypatch.setattr(MADDPG, "_optimize", diverging)
+        monkeypatch.setattr(MADDPG, "_step", diverging)
     folder, worked = train.train(tiny(), 0, "native", tmp_path)
     assert worked
     record = read_record(folder)
