@@ -45,7 +45,7 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     :param folder: of all runs
     """
     runs = runs_of(grid, folder)
-    bands = _bands(runs, folder)
+    bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
     asked = {job.config.cell for job in grid.jobs} | set(grid.aliases)
     methods = {cell.method for cell in asked if cell.setting in curves.SETTINGS}
     others = sorted(methods - set(ALL_METHODS))
@@ -59,12 +59,16 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     }
 
 
-def _bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
-    """Read the learning curves of the finished runs in Figure 4's settings."""
+def read_bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
+    """Read the learning curves of the finished runs.
+
+    :param folder: of all runs
+    :raises DamagedFileError: for a curve that is not what its run wrote
+    """
     by_cell: dict[Cell, list[curves.Curve]] = {}
     rounds: dict[Cell, int] = {}
     for run in runs:
-        if run.status == "finished" and run.cell.setting in curves.SETTINGS:
+        if run.status == "finished":
             path = folder / run_path(run.cell, run.seed)
             record = read_record(path)
             data = files.read_bytes(
