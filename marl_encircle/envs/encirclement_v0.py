@@ -208,7 +208,8 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             gymnasium.logger.warn("render() draws nothing: give render_mode='human' or 'rgb_array' to parallel_env")
             return None
         renderer = _load_renderer()
-        view = renderer.view(self._arena.simulator, self.reward.closure, self._trail)
+        success = {rule: int(step[0]) or None for rule, step in self._arena.rounds.success_step.items()}
+        view = renderer.view(self._arena.simulator, self.reward.closure, self._trail, success=success)
         if self.render_mode == "rgb_array":
             picture: NDArray[np.uint8] = renderer.picture(view)
             return picture

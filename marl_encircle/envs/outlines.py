@@ -75,6 +75,19 @@ def facing_arc(offset: Array, speed_ratio: float) -> tuple[Array, Array]:
     return phi + math.atan2(offset[1], offset[0]), distance
 
 
+def far_arc(offset: Array, speed_ratio: float) -> tuple[Array, Array]:
+    """Return the rest of the circle: where the same rays leave it; inf where lambda is 1 and the circle a line.
+
+    :param offset: from the target to the pursuer, not zero [scene units], (2,)
+    :param speed_ratio: lambda
+    :return: angles [rad] and distances from the target [scene units], (181,) each
+    """
+    angles, near = facing_arc(offset, speed_ratio)
+    with np.errstate(divide="ignore"):
+        power = np.float64(offset @ offset) / (1 - 1 / np.float64(speed_ratio) ** 2)  # of the target: near times far
+    return angles, power / near
+
+
 def polar(centre: Array, angles: NDArray[np.floating[Any]], distances: Array) -> Array:
     """Return the places at these angles and distances from a centre, (L, 2).
 

@@ -17,7 +17,7 @@ PURSUERS: tuple[Colour, ...] = (
 """Okabe and Ito's colours, which colour-blind people tell apart; an eighth pursuer has the first one's again."""
 
 INK: Colour = (34, 34, 38)
-FAINT: Colour = (122, 122, 128)
+FAINT: Colour = (106, 106, 112)
 LINE: Colour = (214, 214, 216)
 PAPER: Colour = (255, 255, 255)
 BACKGROUND: Colour = (246, 246, 244)
@@ -61,6 +61,15 @@ def entity_colour(entity: int, pursuers: int) -> Colour:
     :param pursuers: number of pursuers N
     """
     return pursuer_colour(entity) if entity < pursuers else OBSTACLE
+
+
+def mixed(colour: Colour, share: float) -> Colour:
+    """Return a colour diluted with that of the paper.
+
+    :param share: of the colour, 0 to 1
+    """
+    red, green, blue = (round(share * own + (1 - share) * white) for own, white in zip(colour, PAPER, strict=True))
+    return red, green, blue
 
 
 def readable_on(colour: Colour) -> Colour:

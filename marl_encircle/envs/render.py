@@ -7,38 +7,42 @@ The panel on the right puts the same measures into figures.
 
 import math
 import os
-from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+import sys
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_encircle.core.geometry import NOBODY, Closure
-from marl_encircle.core.scenario import Scenario
-from marl_encircle.core.simulator import Simulator
-from marl_encircle.envs.outlines import borders, facing_arc, polar, stretches, wedges
+from marl_encircle.envs.gauges import Panel
+from marl_encircle.envs.outlines import facing_arc, far_arc, polar, wedges
 from marl_encircle.envs.palette import (
     BACKGROUND,
-    FAINT,
     GOOD,
-    GROOVE,
     INK,
     LINE,
     OBSTACLE,
     OBSTACLE_EDGE,
     PAPER,
-    Colour,
     entity_colour,
+    mixed,
     pursuer_colour,
     readable_on,
 )
+from marl_encircle.envs.pen import SUPERSAMPLING, draw_owners, pygame, write
+from marl_encircle.envs.view import Layers, View, view
 
-os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-try:
-    import pygame
-except ImportError as error:
-    raise ImportError("drawing needs pygame-ce: pip install 'marl-encircle[render]'") from error
+__all__ = [
+    "PANEL",
+    "SCENE",
+    "Window",
+    "array_of",
+    "check_display",
+    "draw",
+    "draw_low",
+    "open_window",
+    "picture",
+    "view",
+]
 
 Array = NDArray[np.float64]
 
@@ -48,69 +52,103 @@ SCENE = 720
 PANEL = 260
 """Width of the panel [pixels]."""
 
-SUPERSAMPLING = 2
-"""Everything is drawn this many times as large and then scaled down, which smooths edges and letters."""
+LOW_SCENE, LOW_TITLE, LOW_PANEL = 560, 56, 186
+"""Of a drawing with the panel below: side of the scene, height of title and panel [pixels]."""
 
+LENS, LENS_REACH = 0.36, 0.19
+"""Side of the lens, as a share of the scene's; what it shows to each side of the target [half widths]."""
 
-class View(NamedTuple):
-    """What is drawn of one world. N pursuers, D discs, K directions."""
+LENS_LIMIT = 0.2
+"""The lens is there once the target can reach no more than a circle of this radius [half widths]."""
 
-    scenario: Scenario
-    pursuers: Array
-    """(N, 2)."""
-    velocities: Array
-    """(N, 2)."""
-    target: Array
-    """(2,)."""
-    discs: Array
-    """x, y, radius, (D, 3)."""
-    speed_ratio: float
-    owner: NDArray[np.int8]
-    """Who is met first in each direction, (K,)."""
-    distance: Array
-    """How far away, (K,)."""
-    movement_range: float
-    complete: bool
-    step: int
-    trail: Sequence[Array]
-    """Pursuers and target at this round's states until now, (N + 1, 2) each."""
+EVERYTHING = Layers()
 
-
-def view(simulator: Simulator, closure: Closure, trail: Sequence[Array] = (), world: int = 0) -> View:
-    """Return what is to be drawn of a world.
-
-    :param closure: the enclosure that is shown
-    :param trail: pursuers and target at this round's states until now, (N + 1, 2) each
-    """
-    s, enclosure = simulator.state, simulator.measure.enclosure[closure]
-    return View(
-        simulator.scenario,
-        s.pursuers[world],
-        s.velocities[world],
-        s.target[world],
-        s.discs[world],
-        float(s.speed_ratio[world]),
-        enclosure.owner[world],
-        enclosure.distance[world],
-        float(enclosure.movement_range[world]),
-        bool(enclosure.complete[world]),
-        int(simulator.steps[world]),
-        trail,
-    )
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+"""Variables of which at least one is set where there is a display."""
 
 
 def picture(view: View) -> NDArray[np.uint8]:
     """Return a drawing of the world, (H, W, 3); needs no display."""
-    return np.ascontiguousarray(pygame.surfarray.array3d(draw(view)).swapaxes(0, 1))
+    return array_of(draw(view))
 
 
-def draw(view: View) -> Any:
-    """Return a drawing of the world as a pygame surface; needs no display."""
-    large = pygame.Surface(((SCENE + PANEL) * SUPERSAMPLING, SCENE * SUPERSAMPLING))
-    large.fill(PAPER)
-    _Scene(large.subsurface((0, 0, SCENE * SUPERSAMPLING, SCENE * SUPERSAMPLING)), view).draw()
-    _Panel(large.subsurface((SCENE * SUPERSAMPLING, 0, PANEL * SUPERSAMPLING, SCENE * SUPERSAMPLING)), view).draw()
+def array_of(surface: Any) -> NDArray[np.uint8]:
+    """Return the pixels of a pygame surface, (H, W, 3)."""
+    return np.ascontiguousarray(pygame.surfarray.array3d(surface).swapaxes(0, 1))
+
+
+def draw(view: View, layers: Layers = EVERYTHING) -> Any:
+    """Return a drawing of the world as a pygame surface, the panel at its right; needs no display."""
+    large = _sheet(SCENE + PANEL, SCENE)
+    _draw_scene(_part(large, 0, 0, SCENE, SCENE), view, layers)
+    Panel(_part(large, SCENE, 0, PANEL, SCENE), view).draw_column()
     return pygame.transform.smoothscale(large, (SCENE + PANEL, SCENE))
+
+
+def draw_low(view: View, layers: Layers = EVERYTHING) -> Any:
+    """Return a narrower drawing, the panel below, of which two fit side by side."""
+    height = LOW_TITLE + LOW_SCENE + LOW_PANEL
+    large = _sheet(LOW_SCENE, height)
+    Panel(_part(large, 0, 0, LOW_SCENE, LOW_TITLE), view).draw_head()
+    _draw_scene(_part(large, 0, LOW_TITLE, LOW_SCENE, LOW_SCENE), view, layers)
+    Panel(_part(large, 0, LOW_TITLE + LOW_SCENE, LOW_SCENE, LOW_PANEL), view).draw_row()
+    return pygame.transform.smoothscale(large, (LOW_SCENE, height))
+
+
+def _draw_scene(surface: Any, view: View, layers: Layers) -> None:
+    scene = _Scene(surface, view, layers)
+    scene.draw()
+    scene.draw_lens()
+
+
+def _sheet(width: int, height: int) -> Any:
+    sheet = pygame.Surface((width * SUPERSAMPLING, height * SUPERSAMPLING))
+    sheet.fill(PAPER)
+    return sheet
+
+
+def _part(sheet: Any, left: int, top: int, width: int, height: int) -> Any:
+    return sheet.subsurface([SUPERSAMPLING * each for each in (left, top, width, height)])
+
+
+def check_display(advice: str) -> None:
+    """Look for a display, and take it.
+
+    :param advice: what to do where there is none
+    :raises RuntimeError: if there is none
+    """
+    try:
+        if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
+            raise pygame.error("no video device")  # SDL would try every driver, and some complain on stderr
+        pygame.display.init()
+        # Where SDL finds no display it takes one that nobody sees; fine only for those who asked for it.
+        if pygame.display.get_driver() in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+            raise pygame.error("no video device")
+    except pygame.error as error:
+        pygame.display.quit()
+        raise RuntimeError(f"found no display to open a window on ({error}); {advice}") from error
+
+
+def open_window(title: str, size: tuple[int, int], advice: str, resizable: bool = False) -> Any:
+    """Return the surface of a new window.
+
+    :param size: width, height [pixels]
+    :param advice: what to do where there is no display
+    :param resizable: by the user, and made to fit the screen at first
+    :raises RuntimeError: if there is no display
+    """
+    check_display(advice)
+    try:
+        if resizable:
+            desktop = pygame.display.get_desktop_sizes()[0]
+            share = min(1.0, 0.92 * desktop[0] / size[0], 0.86 * desktop[1] / size[1])
+            size = (max(round(share * size[0]), 1), max(round(share * size[1]), 1))
+        screen = pygame.display.set_mode(size, pygame.RESIZABLE if resizable else 0)
+    except pygame.error as error:
+        pygame.display.quit()
+        raise RuntimeError(f"found no display to open a window on ({error}); {advice}") from error
+    pygame.display.set_caption(title)
+    return screen
 
 
 class Window:
@@ -122,19 +160,11 @@ class Window:
     """
 
     def __init__(self, title: str, fps: int) -> None:
-        try:
-            pygame.display.init()
-            # Where SDL finds no display it takes one that nobody sees; fine only for those who asked for it.
-            if pygame.display.get_driver() in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
-                raise pygame.error("no video device")
-            self._screen = pygame.display.set_mode((SCENE + PANEL, SCENE))
-        except pygame.error as error:
-            pygame.display.quit()
-            raise RuntimeError(
-                f"render_mode='human' found no display to open a window on ({error}); use render_mode='rgb_array', "
-                "which needs none, or set SDL_VIDEODRIVER=dummy to draw into nothing"
-            ) from error
-        pygame.display.set_caption(title)
+        advice = (
+            "instead of render_mode='human' use render_mode='rgb_array', which needs none, or set "
+            "SDL_VIDEODRIVER=dummy to draw into nothing"
+        )
+        self._screen = open_window(title, (SCENE + PANEL, SCENE), advice)
         self._fps = fps
         self._clock = pygame.time.Clock()
 
@@ -155,34 +185,89 @@ class Window:
 
 
 class _Scene:
-    """The left part of a drawing, in which scene units become pixels."""
+    """The scene, in which scene units become pixels.
 
-    def __init__(self, surface: Any, view: View) -> None:
-        self.surface, self.view = surface, view
+    :param centre: of a lens; without one the whole scene is drawn
+    """
+
+    def __init__(self, surface: Any, view: View, layers: Layers, centre: Array | None = None) -> None:
+        self.surface, self.view, self.layers = surface, view, layers
         scenario = view.scenario
         # Bodies' centres reach the edge, so that the picture is wider than the scene by a body.
         reach = scenario.half_width + max(scenario.pursuer_radius, scenario.target_radius, 0.04 * scenario.half_width)
         self.side = surface.get_width()
-        self.scale = self.side / (2 * reach)
+        self.centre = np.zeros(2) if centre is None else centre
+        self.scale = self.side / (2 * (reach if centre is None else LENS_REACH * scenario.half_width))
         edge = scenario.half_width * self.scale
-        self.area = pygame.Rect(self.side / 2 - edge, self.side / 2 - edge, 2 * edge, 2 * edge)
+        left, top = self._pixel(np.array([-scenario.half_width, scenario.half_width]))
+        self.area = pygame.Rect(left, top, 2 * edge, 2 * edge)
 
     def draw(self) -> None:
         """Draw from the ground up."""
         self._draw_ground()
         self.surface.set_clip(self.area)
-        self._draw_wedges()
-        self._draw_trails()
-        self._draw_arcs()
-        self.surface.set_clip(None)
+        if self.layers.area:
+            self._draw_wedges()
+        if self.layers.trails:
+            self._draw_trails()
+        if self.layers.circles:
+            self._draw_circles()
         self._draw_obstacles()
-        self._draw_ring()
+        pygame.draw.rect(self.surface, LINE, self.area, 2 * SUPERSAMPLING)
+        self.surface.set_clip(None)
+        if self.layers.angles:
+            self._draw_ring()
+        self._draw_way_ahead()
         self._draw_pursuers()
         self._draw_target()
 
+    def draw_inside(self) -> None:
+        """Draw what bodies and trails would hide: the bodies as outlines."""
+        self._draw_ground()
+        self.surface.set_clip(self.area)
+        if self.layers.area:
+            self._draw_wedges()
+        if self.layers.circles:
+            self._draw_circles()
+        self._draw_obstacles()
+        pygame.draw.rect(self.surface, LINE, self.area, 2 * SUPERSAMPLING)
+        self.surface.set_clip(None)
+        radius = max(self.view.scenario.pursuer_radius * self.scale, 4 * SUPERSAMPLING)
+        for i, place in enumerate(self.view.pursuers):
+            pygame.draw.circle(self.surface, pursuer_colour(i), self._pixel(place), radius, 2 * SUPERSAMPLING)
+            write(self.surface, str(i), self._pixel(place), 15, INK, 0.5, bold=True)
+        around = max(self.view.scenario.target_radius * self.scale, 4 * SUPERSAMPLING)
+        pygame.draw.circle(self.surface, INK, self._pixel(self.view.target), around, SUPERSAMPLING)
+        pygame.draw.circle(self.surface, INK, self._pixel(self.view.target), 4 * SUPERSAMPLING)
+
+    def draw_lens(self) -> None:
+        """Draw what is about the target larger, in a corner, while the target can reach little."""
+        view, half = self.view, self.view.scenario.half_width
+        if not (self.layers.lens and math.sqrt(view.movement_range / math.pi) < LENS_LIMIT * half):
+            return
+        side = round(LENS * self.side)
+        gap = self.area.left + 6 * SUPERSAMPLING
+        corners = [(x, y) for x in (gap, self.side - gap - side) for y in (gap, self.side - gap - side)]
+        bodies = [self._pixel(body) for body in (view.target, *view.pursuers)]
+
+        def room(corner: tuple[int, int]) -> float:
+            """Return how far the nearest body is from the middle of the lens."""
+            return min(float(max(abs(x - corner[0] - side / 2), abs(y - corner[1] - side / 2))) for x, y in bodies)
+
+        place = max(corners, key=room)
+        lens = pygame.Surface((side, side))
+        _Scene(lens, view, self.layers, centre=view.target).draw_inside()
+        pygame.draw.rect(lens, INK, lens.get_rect(), 2 * SUPERSAMPLING)
+        self.surface.blit(lens, place)
+        shown = LENS_REACH * half * self.scale
+        x, y = bodies[0]
+        frame = pygame.Rect(x - shown, y - shown, 2 * shown, 2 * shown).clip(self.area)
+        pygame.draw.rect(self.surface, INK, frame, SUPERSAMPLING)
+
     def _pixel(self, place: Array) -> tuple[float, float]:
         """Return where a place in the scene lies on the surface; y points up in the scene, down in the picture."""
-        return self.side / 2 + float(place[0]) * self.scale, self.side / 2 - float(place[1]) * self.scale
+        x, y = place[0] - self.centre[0], place[1] - self.centre[1]
+        return self.side / 2 + float(x) * self.scale, self.side / 2 - float(y) * self.scale
 
     def _polar(self, angles: NDArray[np.floating[Any]], distances: Array) -> list[tuple[float, float]]:
         """Return pixels at these angles and distances from the target."""
@@ -196,11 +281,10 @@ class _Scene:
             x, y = self.area.left + share * self.area.width, self.area.top + share * self.area.height
             pygame.draw.line(self.surface, BACKGROUND, (x, self.area.top), (x, self.area.bottom), SUPERSAMPLING)
             pygame.draw.line(self.surface, BACKGROUND, (self.area.left, y), (self.area.right, y), SUPERSAMPLING)
-        pygame.draw.rect(self.surface, LINE, self.area, 2 * SUPERSAMPLING)
 
     def _draw_wedges(self) -> None:
         """Tint what the target can reach before it is met, in the colour of who meets it there."""
-        view, closed = self.view, math.isfinite(self.view.movement_range)
+        view, closed = self.view, self.view.closed
         layer = pygame.Surface((self.side, self.side), pygame.SRCALPHA)
         centre = self._pixel(view.target)
         for wedge in wedges(view.owner, view.distance, closed):
@@ -211,7 +295,7 @@ class _Scene:
         if closed:
             count = len(view.owner)
             outline = self._polar(np.arange(count) * (2 * np.pi / count), view.distance)
-            pygame.draw.lines(self.surface, INK, True, outline, 2 * SUPERSAMPLING)
+            pygame.draw.lines(self.surface, GOOD if view.complete else INK, True, outline, 2 * SUPERSAMPLING)
 
     def _draw_trails(self) -> None:
         if len(self.view.trail) < 2:
@@ -222,8 +306,9 @@ class _Scene:
             colour = pursuer_colour(body) if body < path.shape[1] - 1 else INK
             pixels = [self._pixel(place) for place in path[:, body]]
             for age, (start, end) in enumerate(zip(pixels[-2::-1], pixels[:0:-1], strict=True)):
-                opacity = max(40, 190 - 6 * age)
-                pygame.draw.line(layer, (*colour, opacity), start, end, 2 * SUPERSAMPLING)
+                fading = (*colour, max(60, 220 - 8 * age))
+                pygame.draw.line(layer, fading, start, end, (3 if age < 6 else 2) * SUPERSAMPLING)
+                pygame.draw.circle(layer, fading, start, 2.5 * SUPERSAMPLING)  # one step is one dot
         self.surface.blit(layer, (0, 0))
 
     def _draw_obstacles(self) -> None:
@@ -232,18 +317,35 @@ class _Scene:
             for disc in self.view.discs:
                 pygame.draw.circle(self.surface, colour, self._pixel(disc), disc[2] * self.scale - edge)
 
-    def _draw_arcs(self) -> None:
-        """Draw the part of each Apollonius circle that faces the target."""
-        ratio = self.view.speed_ratio
+    def _draw_circles(self) -> None:
+        """Draw the Apollonius circles, the part that faces the target thicker."""
+        ratio, reach = self.view.speed_ratio, 10 * self.view.scenario.half_width
         for i, offset in enumerate(self.view.pursuers - self.view.target):
             if np.hypot(*offset) == 0.0:
                 continue
+            angles, distances = far_arc(offset, ratio)
+            near = distances < reach  # nearly a straight line otherwise
+            if near.all():
+                pale = mixed(pursuer_colour(i), 0.5)
+                pygame.draw.lines(self.surface, pale, False, self._polar(angles, distances), SUPERSAMPLING)
             pixels = self._polar(*facing_arc(offset, ratio))
-            pygame.draw.lines(self.surface, pursuer_colour(i), False, pixels, SUPERSAMPLING)
+            pygame.draw.lines(self.surface, pursuer_colour(i), False, pixels, 2 * SUPERSAMPLING)
 
     def _draw_ring(self) -> None:
         unit = max(self.view.scenario.target_radius, 0.02 * self.view.scenario.half_width) * self.scale
-        _draw_ring(self.surface, self.view, self._pixel(self.view.target), 1.3 * unit, 1.75 * unit)
+        centre = self._pixel(self.view.target)
+        draw_owners(self.surface, self.view.owner, self.view.scenario.pursuers, centre, 1.3 * unit, 1.75 * unit)
+
+    def _draw_way_ahead(self) -> None:
+        """Draw the path that the target takes in the next step."""
+        if self.view.ahead is None or np.allclose(self.view.ahead, self.view.target):
+            return
+        radius = max(0.3 * self.view.scenario.target_radius * self.scale, 3 * SUPERSAMPLING)
+        start, end = self._pixel(self.view.target), self._pixel(self.view.ahead)
+        for colour, wider in ((PAPER, 2 * SUPERSAMPLING), (INK, 0)):
+            pygame.draw.line(self.surface, colour, start, end, 2 * SUPERSAMPLING + wider)
+            pygame.draw.circle(self.surface, colour, end, radius + wider / 2)
+        pygame.draw.circle(self.surface, PAPER, end, radius - 2 * SUPERSAMPLING)
 
     def _draw_target(self) -> None:
         x, y = self._pixel(self.view.target)
@@ -265,105 +367,6 @@ class _Scene:
                 pygame.draw.polygon(self.surface, INK, arrow)
             pygame.draw.circle(self.surface, INK, (x, y), radius)
             pygame.draw.circle(self.surface, pursuer_colour(i), (x, y), radius - 2 * SUPERSAMPLING)
-            size = int(1.3 * radius / SUPERSAMPLING)
+            size = int(1.05 * radius / SUPERSAMPLING)
             if size >= 8:
-                _write(self.surface, str(i), (x, y), size, readable_on(pursuer_colour(i)), 0.5)
-
-
-class _Panel:
-    """The right part of a drawing: the round, the ring at large, everybody's share, the movement range."""
-
-    def __init__(self, surface: Any, view: View) -> None:
-        self.surface, self.view = surface, view
-        self.left, self.right = 22 * SUPERSAMPLING, (PANEL - 22) * SUPERSAMPLING
-        self.closed = math.isfinite(view.movement_range)
-
-    def draw(self) -> None:
-        """Draw from top to bottom."""
-        pygame.draw.line(self.surface, LINE, (0, 0), (0, self.surface.get_height()), SUPERSAMPLING)
-        view, closed = self.view, self.closed
-        state, colour = ("complete", GOOD) if view.complete else ("closed", INK) if closed else ("open", FAINT)
-        self._write(state, 36, 28, colour)
-        self._write(f"step {view.step} of {view.scenario.max_cycles}", 37, 17, FAINT, at_right=True)
-        self._draw_ring(174)
-        bottom = self._draw_shares(300)
-        self._draw_movement_range(bottom + 30)
-        self._write(f"target {view.speed_ratio:g} times as fast", 696, 17, FAINT)
-
-    def _draw_ring(self, y: float) -> None:
-        centre = (self.surface.get_width() / 2, y * SUPERSAMPLING)
-        _draw_ring(self.surface, self.view, centre, 62 * SUPERSAMPLING, 90 * SUPERSAMPLING)
-        owned = float((self.view.owner != NOBODY).mean())
-        _write(self.surface, f"{owned:.0%}", (centre[0], centre[1] - 6 * SUPERSAMPLING), 38, INK, 0.5)
-        _write(self.surface, "of the circle", (centre[0], centre[1] + 22 * SUPERSAMPLING), 16, FAINT, 0.5)
-
-    def _draw_shares(self, y: float) -> float:
-        """Draw one bar each; return where they end."""
-        self._write("contributing angles", y, 17, FAINT)
-        shares = _shares(self.view)
-        height = min(22.0, 250 / len(shares))
-        y += 24 - height / 2
-        for label, share, colour in shares:
-            y += height
-            self._draw_bar(y, min(10, height), 34, 50, share, colour)
-            if height >= 12:
-                self._write(label, y, 17, INK)
-                self._write(f"{share:.0%}", y, 17, INK, at_right=True)
-        return y + height / 2
-
-    def _draw_movement_range(self, y: float) -> None:
-        view, limit = self.view, self.view.scenario.movement_range_limit
-        self._write("movement range", y, 17, FAINT)
-        self._write(f"{view.movement_range:.3g}" if self.closed else "unbounded", y, 17, INK, at_right=True)
-        # From a hundred times the limit down to it, by orders of magnitude.
-        share = 1 - math.log10(max(view.movement_range / limit, 1.0)) / 2 if self.closed else 0.0
-        self._draw_bar(y + 24, 12, 0, 0, share, GOOD if view.complete else INK)
-        self._write(f"complete below {limit:g}", y + 46, 15, FAINT, at_right=True)
-
-    def _draw_bar(self, y: float, height: float, indent: float, outdent: float, share: float, colour: Colour) -> None:
-        """Draw a bar around y that is full at 1."""
-        left, right = self.left + indent * SUPERSAMPLING, self.right - outdent * SUPERSAMPLING
-        area = pygame.Rect(left, (y - height / 2) * SUPERSAMPLING, right - left, height * SUPERSAMPLING)
-        pygame.draw.rect(self.surface, GROOVE, area, border_radius=area.height // 2)
-        width = round(area.width * min(max(share, 0.0), 1.0))
-        if width > 0:
-            # A short bar has no room for round ends of its own: cut it from a full one.
-            self.surface.set_clip((*area.topleft, width, area.height))
-            pygame.draw.rect(self.surface, colour, area, border_radius=area.height // 2)
-            self.surface.set_clip(None)
-
-    def _write(self, text: str, y: float, size: int, colour: Colour, at_right: bool = False) -> None:
-        place = (self.right if at_right else self.left, y * SUPERSAMPLING)
-        _write(self.surface, text, place, size, colour, 1.0 if at_right else 0.0)
-
-
-def _shares(view: View) -> list[tuple[str, float, Colour]]:
-    """Return label, share of the circle and colour of every pursuer, and of the obstacles together."""
-    n = view.scenario.pursuers
-    shares = [(str(i), float((view.owner == i).mean()), pursuer_colour(i)) for i in range(n)]
-    if len(view.discs):
-        shares.append(("obst.", float((view.owner >= n).mean()), OBSTACLE))
-    return shares
-
-
-def _draw_ring(surface: Any, view: View, centre: tuple[float, float], inner: float, outer: float) -> None:
-    """Draw a ring whose segments have the colours of who owns these directions; nobody's are left pale."""
-    for owner, directions in stretches(view.owner):
-        angles = borders(directions, len(view.owner))
-        fine = np.linspace(angles[0], angles[-1], 6 * len(angles))
-        unit = np.stack([np.cos(fine), -np.sin(fine)], axis=1)
-        outline = np.concatenate([centre + outer * unit, centre + inner * unit[::-1]])
-        colour = LINE if owner == NOBODY else entity_colour(owner, view.scenario.pursuers)
-        pygame.draw.polygon(surface, colour, outline.tolist())
-
-
-def _write(surface: Any, text: str, place: tuple[float, float], size: int, colour: Colour, align: float) -> None:
-    """Write text around the height of ``place``: to its right (``align`` 0), around it (0.5) or to its left (1)."""
-    written = _font(size * SUPERSAMPLING).render(text, True, colour)
-    surface.blit(written, (place[0] - align * written.get_width(), place[1] - written.get_height() / 2))
-
-
-@lru_cache
-def _font(size: int) -> Any:
-    pygame.font.init()
-    return pygame.font.Font(None, size)
+                write(self.surface, str(i), (x, y), size, readable_on(pursuer_colour(i)), 0.5, bold=True)

@@ -11,9 +11,11 @@ import pygame
 import pytest
 from pettingzoo_tests import render_test
 
-from marl_encircle.envs import encirclement_v0, palette, render
+from marl_encircle.envs import encirclement_v0, palette, pen, render
 from marl_encircle.envs.encirclement_v0 import parallel_env
+from marl_encircle.envs.outlines import facing_arc, far_arc, polar
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
+from marl_encircle.envs.view import Layers
 
 SHAPE = (render.SCENE, render.SCENE + render.PANEL, 3)
 
@@ -146,6 +148,69 @@ def test_nothing_is_drawn_into_the_panel_by_the_scene() -> None:
     with_bodies = render.picture(render.view(env.simulator, "all"))
     border = with_bodies[:, render.SCENE + 1]
     assert (border == palette.PAPER).all()
+
+
+def seen(env: Any, **changes: Any) -> render.View:
+    return render.view(env.simulator, "all")._replace(**changes)
+
+
+def painted(view: render.View, layers: Layers = Layers()) -> np.ndarray:  # noqa: B008 - a named tuple
+    return render.array_of(render.draw(view, layers)).astype(int)
+
+
+def test_the_way_ahead_is_drawn_between_the_target_and_its_next_place() -> None:
+    env = drawn(pursuers=1, obstacles=0)
+    env.simulator.state.target[0] = [0.0, 0.0]
+    env.simulator.state.pursuers[0] = [[-0.9, -0.9]]
+    changed = (painted(seen(env)) != painted(seen(env, ahead=np.array([0.2, 0.0])))).any(axis=2)
+    y, x = np.nonzero(changed)  # (0.2, 0) is at 360 + 0.2 * 342.86 = 429, 360; the mark's radius is 0.3 * 17 pixels
+    assert x.min() > 360
+    assert 429 < x.max() < 429 + 8
+    assert abs(y - 360).max() < 8
+
+
+def test_an_apollonius_circle_goes_through_the_places_that_both_reach_at_once() -> None:
+    # Target at 0, pursuer at 0.3, twice as slow: 0.2 from the target is 0.1 from the pursuer, 0.6 is 0.3 from it.
+    near, far = facing_arc(np.array([0.3, 0.0]), 2.0), far_arc(np.array([0.3, 0.0]), 2.0)
+    assert near[1].min() == pytest.approx(0.2)
+    assert far[1].max() == pytest.approx(0.6)
+    assert near[1][[0, -1]] == pytest.approx(far[1][[0, -1]])  # the tangents' ends
+    for angles, distances in (near, far):
+        places = polar(np.zeros(2), angles, distances)
+        assert np.hypot(*places.T) == pytest.approx(2 * np.hypot(*(places - [0.3, 0.0]).T))
+    assert np.isinf(far_arc(np.array([0.3, 0.0]), 1.0)[1]).all()
+
+
+def test_without_any_layer_only_bodies_are_drawn_and_the_panel_stays() -> None:
+    env = drawn(pursuers=3, obstacles=1)
+    trail = [np.zeros((4, 2)), np.full((4, 2), 0.5)]
+    bare, full = (painted(seen(env, trail=trail), layers) for layers in (Layers(*[False] * 5), Layers()))
+    assert np.array_equal(bare[:, render.SCENE :], full[:, render.SCENE :])
+    colours = {tuple(colour) for colour in bare[:, : render.SCENE].reshape(-1, 3)[::7]}
+    assert palette.PURSUERS[1] in colours
+    assert (full != bare)[:, : render.SCENE].any(axis=2).sum() > 1000
+
+
+def test_the_panel_tells_success_under_both_rules_and_the_reward() -> None:
+    env = drawn()
+    plain = painted(seen(env))
+    for change in (
+        {"success": {"all": None, "pursuers": None}},
+        {"success": {"all": 3, "pursuers": None}},
+        {"success": {"all": 3, "pursuers": 4}},
+        {"rewards": (0.5, 1.5)},
+        {"title": "ours", "caption": "round 1"},
+    ):
+        changed = (painted(seen(env, **change)) != plain).any(axis=2)
+        assert changed[:, render.SCENE :].any(), change
+        assert not changed[:, : render.SCENE].any()
+
+
+def test_long_names_are_cut_and_symbols_are_not_mistaken_for_names() -> None:
+    assert pen.cut("ours", 17, 130, bold=True) == "ours"
+    assert pen.cut("a_very_long_name_of_a_method", 17, 130, bold=True).endswith("…")
+    assert pen._pieces("model_b") == [(False, "model_b")]
+    assert pen._pieces("range R_m") == [(False, "range R"), (True, "m")]
 
 
 def test_colours_differ_also_in_brightness_or_hue_for_colour_blind_eyes() -> None:
