@@ -87,6 +87,7 @@ class Replay:
     :param discs: x, y, radius of the discs that obstacles consist of; they stay where they are [scene units], (D, 3)
     :param enclosure: by closure rule; as the simulator measures it, with the moments in place of the worlds: ``owner``
         and ``nearness`` (T + 1, K), ``contributing_angle`` (T + 1, N + M), the others (T + 1,)
+    :param rewards: of each pursuer at every step, (T, N)
     """
 
     scenario: Scenario
@@ -100,6 +101,7 @@ class Replay:
     target: Array
     discs: Array
     enclosure: dict[Closure, Enclosure]
+    rewards: Array
 
     @property
     def length(self) -> int:
@@ -142,10 +144,12 @@ def record_round(
     sim = arena.simulator
     sim.seed(seeds)
     observations = arena.reset()
-    moments = [_Moment.of(sim, world)]
+    moments, rewards = [_Moment.of(sim, world)], []
     for _ in range(scenario.max_cycles):
         slots, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
-        observations = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE)).observations
+        outcome = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE))
+        observations = outcome.observations
+        rewards.append(outcome.rewards[world].astype(np.float64))
         moments.append(_Moment.of(sim, world))
         steps = {rule: int(step[world]) for rule, step in arena.rounds.success_step.items()}
         if NEVER not in steps.values():
@@ -162,6 +166,7 @@ def record_round(
         target=_stack(moments, lambda moment: moment.target),
         discs=_frozen(sim.state.discs[world].copy()),
         enclosure={"all": _over_time(moments, "all"), "pursuers": _over_time(moments, "pursuers")},
+        rewards=_frozen(np.stack(rewards)),
     )
 
 
