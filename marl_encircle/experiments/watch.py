@@ -204,7 +204,7 @@ class Match:
 
     def length(self, number: int) -> int:
         """Return the number of steps of a round, of the longer one where there are two."""
-        return max(replay.length for replay in self.replays(number))
+        return max(end_of(replay) for replay in self.replays(number))
 
     def views(self, number: int, step: int) -> list[View]:
         """Return what is seen of a round at one step; a round that is over stays at its end.
@@ -216,7 +216,7 @@ class Match:
         return [
             view_of(
                 replay,
-                min(step, replay.length),
+                min(step, end_of(replay)),
                 side.title,
                 f"policy of {side.trained_as}\n{caption}" if side.trained_as else caption,
             )
@@ -244,6 +244,16 @@ def fresh_seed(sides: tuple[Side, ...]) -> int:
         for seed in (side.train_seed, side.config.evaluation.seed, side.config.evaluation.curve_seed)
     }
     return next(seed for seed in range(WATCHED_SEED, WATCHED_SEED + len(used) + 1) if seed not in used)
+
+
+def end_of(replay: Replay) -> int:
+    """Return the step at which a round is over for its spectators.
+
+    When both rules have held; at the method's own success if the other rule never holds; else when time is up.
+    """
+    if replay.success_step is None or None not in (replay.step_all, replay.step_pursuers):
+        return replay.length
+    return replay.success_step
 
 
 def view_of(replay: Replay, step: int, title: str = "", caption: str = "") -> View:

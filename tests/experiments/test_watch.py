@@ -26,7 +26,7 @@ from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.player import BAR, SPEEDS, Player, timeline
 from marl_encircle.experiments.records import run_path
-from marl_encircle.experiments.watch import Match, Side, find_match, find_run, find_side, fresh_seed
+from marl_encircle.experiments.watch import Match, Side, end_of, find_match, find_run, find_side, fresh_seed
 from marl_encircle.experiments.yaml_files import ConfigError
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
@@ -144,7 +144,7 @@ def test_two_policies_start_alike_and_go_their_own_ways_by_one_clock() -> None:
     mine, other = duel().replays(0)
     assert np.array_equal(mine.pursuers[0], other.pursuers[0])
     assert not np.array_equal(mine.pursuers[2], other.pursuers[2])
-    shorter, longer = sorted(each.length for each in (mine, other))
+    shorter, longer = sorted(end_of(each) for each in (mine, other))
     steps = [view.step for view in duel().views(0, longer)]
     assert sorted(steps) == [shorter, longer]
 
@@ -166,7 +166,8 @@ def test_the_way_ahead_is_the_targets_next_move_and_success_is_not_told_beforeha
     rounds = play_rounds(side().policy, side().config, 40, 5)
     number = next(each.round for each in rounds if each.step_all)
     replay = match().replays(number)[0]
-    for step in range(replay.length + 1):
+    assert match().length(number) == end_of(replay)
+    for step in range(end_of(replay) + 1):
         view = match().views(number, step)[0]
         if step < replay.length:
             assert np.array_equal(view.ahead, replay.target[step + 1])
@@ -179,6 +180,23 @@ def test_the_way_ahead_is_the_targets_next_move_and_success_is_not_told_beforeha
         assert len(view.trail) == step + 1
         assert view.complete == bool(replay.enclosure["all"].complete[step])
     assert replay.seed == world_seeds(5, number + 1)[number]
+
+
+@pytest.mark.parametrize(
+    ("closure", "step_all", "step_pursuers", "end"),
+    [
+        ("all", 7, 12, 12),
+        ("all", 7, None, 7),
+        ("pursuers", 7, None, 20),
+        ("all", None, None, 20),
+    ],
+)
+def test_a_round_is_over_when_nothing_more_can_succeed(
+    closure: Any, step_all: int | None, step_pursuers: int | None, end: int
+) -> None:
+    replay = replace(match().replays(0)[0], closure=closure, step_all=step_all, step_pursuers=step_pursuers)
+    replay = replace(replay, target=np.zeros(((12 if step_pursuers else 20) + 1, 2)))
+    assert end_of(replay) == end
 
 
 def test_rewards_add_up_to_the_rounds_return() -> None:
