@@ -298,7 +298,7 @@ def test_the_keyboard_is_enough(opened: Opened) -> None:
     press("Space")
     assert (box.is_checked(), opened.part("play").get_attribute("aria-label")) == (False, "Play")
     opened.part("round").focus()
-    press("ArrowDown")
+    press("ArrowRight")
     assert (opened.part("round").evaluate("s => s.selectedIndex"), opened.step()) == (1, opened.last())
 
 
