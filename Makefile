@@ -27,7 +27,7 @@ export OMP_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
 .PHONY: help setup test test-sb3 check lint format format-check typecheck imports spelling \
-        train evaluate sweep tables figures calibrate verify-results reproduce-tables bench tensorboard clean
+        train evaluate sweep tables figures report test-browser calibrate verify-results reproduce-tables bench tensorboard clean
 
 help:  ## list the targets and the variables
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / {printf "  %-18s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -83,6 +83,12 @@ tables: $(READY)  ## render the tables from the runs there are: GRID RESULTS
 
 figures: $(READY)  ## draw the figures from the runs there are: GRID RESULTS
 	$(CLI) figures --grid $(GRID) --out $(RESULTS)
+
+report: $(READY)  ## tables, curves and a player of rounds in one HTML file: GRID RESULTS
+	$(CLI) report --grid $(GRID) --out $(RESULTS)
+
+test-browser: $(READY)  ## the report in a real browser (CHROMIUM=, or one on the path)
+	$(PYTHON) -m pytest tests/browser/report_page.py $(PYTEST_ARGS)
 
 calibrate: $(READY)  ## choose the study's scenario by its protocol: JOBS RESULTS
 	$(CLI) calibrate --out $(RESULTS)/calibration --jobs $(JOBS)

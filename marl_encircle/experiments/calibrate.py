@@ -17,7 +17,6 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import yaml
 from pydantic import Field, ValidationError
 
 from marl_encircle import files
@@ -173,14 +172,14 @@ def name_of(changes: Changes) -> str:
 
 def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
     """Return the sensitivity table, as Markdown and CSV, and the chosen scenario as YAML: file name -> text."""
-    cells = protocol.cells
+    cells, chosen = protocol.cells, calibration.chosen.changes
     rows = [(name_of(trial.changes), trial.results, f"{trial.distance:.2f}") for trial in calibration.trials]
     rows.append(("the paper", tuple(paper_cells()[cell] for cell in cells), ""))
     columns = [f"ratio {s.speed_ratio:g}, n={s.pursuers}, m={s.obstacles}" for _, s in cells]
     header = ["Scenario", *(f"S % / MEL at {column}" for column in columns), "Distance"]
     seeds = ", ".join(map(str, protocol.seeds))
     notes = [
-        f"Chosen: {name_of(calibration.chosen.changes)}.",
+        f"Chosen: {name_of(chosen)}.",
         f"A row names what differs from the centre, the scenario {protocol.scenario}.",
         f"Each scenario was trained anew, {protocol.reward} with the tuning seeds {seeds}; numbers are their means.",
         "Distance: |S - paper| in points + |MEL - paper| in steps, summed over the settings.",
@@ -202,7 +201,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
             notes,
         ),
         "sensitivity.csv": table.getvalue(),
-        "scenario.yaml": yaml.safe_dump({"base": protocol.scenario, **calibration.chosen.changes}, sort_keys=False),
+        "scenario.yaml": "".join(f"{key}: {value}\n" for key, value in {"base": protocol.scenario, **chosen}.items()),
     }
 
 
