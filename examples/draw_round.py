@@ -1,6 +1,6 @@
 """Play one round with a trained policy and draw its last step.
 
-python examples/draw_round.py results/runs/ours/ratio1.1_n3_m1_random/seed900 docs/images/round.png --seed 7
+python examples/draw_round.py results/runs/ours/ratio1.1_n3_m1_random/seed900 round.png --seed 7
 """
 
 import argparse
