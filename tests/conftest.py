@@ -2,7 +2,7 @@
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # libraries read it when they are imported
+os.environ["OMP_NUM_THREADS"] = "1"  # libraries read it when they are imported
 
 from hypothesis import HealthCheck, settings
 

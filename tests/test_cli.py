@@ -16,6 +16,7 @@ from stable_baselines3.common import logger
 from tiny_runs import (
     TINY,
     Done,
+    Trained,
     command,
     contents,
     copy_of_finished,
@@ -392,23 +393,12 @@ def test_verification_of_nothing_ends_with_3(run: Run, tmp_path: Path) -> None:
 # sweep, tables, reproduce-tables
 
 
-class Made:
+class Made(Trained):
     """A worker that trains in this process, unless its seed is 7."""
 
     def __init__(self, job: grids.Job, out: Path) -> None:
         if job.seed != 7:
-            train.train(job.config, job.seed, "native", out)
-
-    def poll(self) -> int:
-        return 0
-
-    def send_signal(self, number: int) -> None:
-        pass
-
-    def wait(self, timeout: float | None = None) -> int:
-        return 0
-
-    kill = wait
+            super().__init__(job, out)
 
 
 @pytest.fixture

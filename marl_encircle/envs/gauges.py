@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marl_encircle.core.geometry import NOBODY
+from marl_encircle.core.geometry import NOBODY, Closure
 from marl_encircle.envs.palette import FAINT, GOOD, INK, LINE, OBSTACLE, PAPER, Colour, pursuer_colour, readable_on
 from marl_encircle.envs.pen import SUPERSAMPLING, cut, draw_bar, draw_owners, pygame, write
 from marl_encircle.envs.view import View
@@ -136,11 +136,12 @@ class Panel:
         if view.success is None:
             return y
         self._write("success", y, 12, FAINT)
-        for rule, label in (("all", "with obstacles"), ("pursuers", "pursuers alone")):
+        labels: dict[Closure, str] = {"all": "with obstacles", "pursuers": "pursuers alone"}
+        for rule, label in labels.items():
             if rule == "all" and not len(view.discs):
                 continue  # the same as the other
             y += 22
-            step = view.success[rule]  # type: ignore[index]  # one of the two rules
+            step = view.success[rule]
             own = rule == view.closure or not len(view.discs)
             place = ((self.left + 7) * SUPERSAMPLING, y * SUPERSAMPLING)
             pygame.draw.circle(self.surface, LINE if step is None else GOOD, place, 7 * SUPERSAMPLING)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import bounds
 from marl_encircle.core.rewards import nearest
 from marl_encircle.core.scenes import SCENES
@@ -264,7 +265,7 @@ def view_of(replay: Replay, step: int, title: str = "", caption: str = "") -> Vi
     enclosure = replay.enclosure[replay.closure]
     moment = replay.snapshot(step)
     rewards = replay.rewards.mean(axis=1)
-    steps = {"all": replay.step_all, "pursuers": replay.step_pursuers}
+    steps: dict[Closure, int | None] = {"all": replay.step_all, "pursuers": replay.step_pursuers}
     return View(
         scenario=replay.scenario,
         pursuers=moment.pursuers,
@@ -279,7 +280,7 @@ def view_of(replay: Replay, step: int, title: str = "", caption: str = "") -> Vi
         step=step,
         trail=[np.vstack([replay.pursuers[past], replay.target[past]]) for past in range(step + 1)],
         closure=replay.closure,
-        success={rule: at if at is not None and at <= step else None for rule, at in steps.items()},  # type: ignore[misc]  # the rules
+        success={rule: at if at is not None and at <= step else None for rule, at in steps.items()},
         ahead=replay.target[step + 1] if step < replay.length else None,
         rewards=(float(rewards[step - 1]) if step else 0.0, float(rewards[:step].sum())),
         title=title,

@@ -62,7 +62,7 @@ class Opened:
     def __init__(self, browser: Browser, path: Path, size: tuple[int, int], scheme: str) -> None:
         width, height = size
         self.name = f"{width}-{scheme}"
-        self.context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)  # type: ignore[arg-type]
+        self.context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)  # type: ignore[arg-type]  # light or dark
         self.page: Page = self.context.new_page()
         self.complaints: list[str] = []
         self.requests: list[str] = []

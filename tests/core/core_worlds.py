@@ -54,7 +54,7 @@ def push(sim: Simulator, *actions: Sequence[float]) -> Simulator:
 def transition(sim: Simulator, closure: str = "all") -> Transition:
     """The present state as reward terms see it."""
     actions = np.zeros((sim.n_worlds, sim.scenario.pursuers, 2))
-    return Transition(sim.scenario, sim.state, actions, sim.measure, sim.former_measure, closure)  # type: ignore[arg-type]
+    return Transition(sim.scenario, sim.state, actions, sim.measure, sim.former_measure, closure)  # type: ignore[arg-type]  # one of the two rules
 
 
 def random_actions(sim: Simulator, rng: np.random.Generator) -> np.ndarray:

@@ -135,9 +135,9 @@ def test_other_peoples_kernels_keep_their_own_folder(tmp_path: Path, monkeypatch
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "theirs"))
     ours = compilation.kernel(lambda x: x + 1)
     assert str(tmp_path / "theirs") == numba.config.CACHE_DIR
-    assert str(compilation._CACHE_FOLDER) in str(ours._cache.cache_path)  # type: ignore[attr-defined]
+    assert str(compilation._CACHE_FOLDER) in str(ours._cache.cache_path)  # type: ignore[attr-defined]  # Numba does not type it
     with pytest.raises(TypeError):
-        compilation.kernel(3)  # type: ignore[arg-type]
+        compilation.kernel(3)  # type: ignore[arg-type]  # that is the test
     assert str(tmp_path / "theirs") == numba.config.CACHE_DIR
 
 

@@ -1,6 +1,5 @@
 """An evaluation round is one world with one seed, whoever plays it and however many are played."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -87,11 +86,3 @@ def test_rounds_are_measured_in_the_evaluations_directions(monkeypatch: pytest.M
     monkeypatch.setattr(evaluate, "Arena", noting)
     play(tiny(overrides=["evaluation.n_directions=180", "scenario.n_directions=36"]), 1)
     assert seen == [180]
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)

@@ -1,11 +1,9 @@
 """A replay is the evaluation round itself, step by step."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch as th
 from tiny_runs import finished, tiny
 
 from marl_encircle.core.simulator import Simulator
@@ -130,11 +128,3 @@ def test_a_snapshot_is_measured_under_the_methods_own_rule() -> None:
         assert moment.occupied_angle == enclosure.occupied_angle[2]
         assert moment.closed == enclosure.closed[2]
         assert moment.contributing_angle.sum() == pytest.approx(moment.occupied_angle)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)
