@@ -273,17 +273,10 @@ def sweep_command(
     wanted, workers = load_grid(grid).jobs, _executor(executor, address)
     with LiveReport() as report:
         progress = sweep(wanted, out, jobs, report, workers)
-    counts = {
-        "done": progress.done,
-        "running": len(progress.running),
-        "failed": len(progress.failed),
-        "diverged": progress.diverged,
-        "left": progress.left,
-    }
     if as_json:
-        typer.echo(json.dumps(counts))
+        typer.echo(json.dumps(progress.counts))
     else:
-        _print_pairs(counts)
+        _print_pairs(progress.counts)
     _exit_if_failed(progress)
 
 

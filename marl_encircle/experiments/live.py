@@ -53,14 +53,7 @@ class LiveReport:
 
 def as_table(progress: Progress) -> Group:
     """Return the counts, and below them the runs that are being trained."""
-    counts = {
-        "done": progress.done,
-        "running": len(progress.running),
-        "failed": len(progress.failed),
-        "diverged": progress.diverged,
-        "left": progress.left,
-        "time left": time_left(progress),
-    }
+    counts = {**progress.counts, "time left": time_left(progress)}
     head = Table(*counts, box=None)
     head.add_row(*map(str, counts.values()))
     runs = Table("running", "world-steps", "of", box=None)

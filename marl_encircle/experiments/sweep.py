@@ -57,6 +57,17 @@ class Progress:
     cpu_seconds: list[float] = field(default_factory=list)
 
     @property
+    def counts(self) -> dict[str, int]:
+        """Runs by what has become of them; they add up to ``total``."""
+        return {
+            "done": self.done,
+            "running": len(self.running),
+            "failed": len(self.failed),
+            "diverged": self.diverged,
+            "left": self.left,
+        }
+
+    @property
     def left(self) -> int:
         """Runs that are neither done, diverged, failed nor running."""
         return self.total - self.done - self.diverged - len(self.failed) - len(self.running)
