@@ -27,6 +27,7 @@ from tiny_runs import (
 )
 
 from marl_encircle import cli, files, locks
+from marl_encircle.cli import configs, machine
 from marl_encircle.experiments import executors, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
@@ -374,7 +375,7 @@ def test_train_without_tensorboard_ends_with_2_and_leaves_nothing(
 def test_figures_without_matplotlib_end_with_2_and_what_to_install(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name in [name for name in sys.modules if name.startswith("marl_encircle.experiments.figures")]:
+    for name in [name for name in sys.modules if name.startswith("marl_encircle.study.figures")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     before = everything_in(tmp_path)
@@ -514,7 +515,20 @@ def test_config_validate_says_valid_or_what_is_wrong(run: Run, tmp_path: Path) -
 
 
 def test_every_command_says_what_it_does(run: Run) -> None:
-    names = ("train", "evaluate", "sweep", "tables", "reproduce-tables", "bench", "config")
+    names = (
+        "train",
+        "evaluate",
+        "watch",
+        "sweep",
+        "calibrate",
+        "tables",
+        "figures",
+        "report",
+        "reproduce-tables",
+        "verify-results",
+        "bench",
+        "config",
+    )
     listing = run("--help")
     assert listing.code == 0
     for name in names:
@@ -523,7 +537,7 @@ def test_every_command_says_what_it_does(run: Run) -> None:
 
 
 def test_bench_outside_a_checkout_says_so(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cli, "PACKAGE", tmp_path / "site-packages" / "marl_encircle")
+    monkeypatch.setattr(machine, "PACKAGE", tmp_path / "site-packages" / "marl_encircle")
     done = run("bench")
     assert done.code == 2
     assert "bench needs a checkout" in done.err
@@ -544,16 +558,15 @@ def test_an_interrupt_while_it_starts_ends_with_130_and_no_traceback(tmp_path: P
 
 
 def test_an_interrupt_in_a_command_ends_with_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "load_config", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(configs, "load_config", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     done = run("config", "validate", "ours")
     assert (done.code, done.out) == (130, "")
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize("module", ["marl_encircle", "marl_encircle.cli"])
-def test_the_module_is_the_command(tmp_path: Path, module: str) -> None:
+def test_the_module_is_the_command(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", module, "config", "validate", "our"],
+        [sys.executable, "-m", "marl_encircle", "config", "validate", "our"],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")

@@ -1,1 +1,1 @@
-"""Names and files become objects here: configurations, trainings, evaluations, tables."""
+"""Names and files become objects here: configurations, trainings, evaluations, sweeps."""

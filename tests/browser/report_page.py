@@ -17,7 +17,7 @@ from packed_rounds import unpacked
 
 from marl_encircle import files
 from marl_encircle.experiments.grid import load_grid
-from marl_encircle.experiments.report.write import report
+from marl_encircle.study.report.write import report
 
 try:
     from playwright.sync_api import Browser, Locator, Page, sync_playwright

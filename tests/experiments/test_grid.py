@@ -7,11 +7,12 @@ import pytest
 from typer.testing import CliRunner
 
 from marl_encircle import cli
+from marl_encircle.cli import runs
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.grid import Grid, Job, arguments, load_grid
-from marl_encircle.experiments.paper import paper_results
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.study.paper import paper_results
 
 ONE = Setting(1.1, 3, 1)
 
@@ -209,7 +210,7 @@ def test_a_job_on_the_command_line_is_the_same_run(monkeypatch: pytest.MonkeyPat
         trained.append((config, seed))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "train", note)
+    monkeypatch.setattr(runs, "train", note)
     job = Job("model_c", Setting(1.25, 4, 2, "concave"), 17, "smoke")
     CliRunner().invoke(cli.app, ["train", *arguments(job), "--out", str(tmp_path)])
     assert trained == [(job.config, 17)]

@@ -1,0 +1,129 @@
+"""One run: train it, evaluate it."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from marl_encircle.cli.options import (
+    Algorithm,
+    AsJson,
+    Obstacles,
+    Out,
+    ProfileOption,
+    Pursuers,
+    Quiet,
+    RewardOption,
+    ScenarioOption,
+    Scene,
+    Set,
+    SpeedRatio,
+    read_config,
+)
+from marl_encircle.cli.printing import print_pairs
+from marl_encircle.experiments.build import Engine, load_run
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.experiments.records import read_record
+from marl_encircle.experiments.train import train, write_episodes
+from marl_encircle.experiments.yaml_files import ConfigError
+
+
+def train_command(
+    reward: RewardOption = "ours",
+    speed_ratio: SpeedRatio = None,
+    pursuers: Pursuers = None,
+    obstacles: Obstacles = None,
+    scene: Scene = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Training seed.")] = 0,
+    scenario: ScenarioOption = "default",
+    algorithm: Algorithm = "maddpg",
+    engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
+    profile: ProfileOption = "full",
+    overrides: Set = None,
+    out: Out = Path("results/runs"),
+    checkpoint_every: Annotated[float, typer.Option(min=1.0, help="Seconds between checkpoints.")] = 120.0,
+    tensorboard: Annotated[bool, typer.Option(help="Write event files into the run folder.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped.
+
+    Example: marl-encircle train --reward ablations/my_idea.yaml --pursuers 4 --set training.world_steps=200000
+    """
+    config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
+    folder, worked = train(
+        config,
+        seed,
+        engine,
+        out,
+        checkpoint_every=checkpoint_every,
+        progress_bar=not quiet,
+        tensorboard=tensorboard,
+    )
+    diverged = read_record(folder).get("status") == "diverged"
+    if not worked:
+        typer.echo("already finished", err=True)
+    if diverged:
+        typer.echo("diverged: the run is kept and counted as diverged; try another seed or configuration", err=True)
+    typer.echo(str(folder))
+    if diverged:
+        raise typer.Exit(1)
+
+
+def evaluate(
+    run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
+    episodes: Annotated[
+        int | None, typer.Option(min=1, max=10**6, help="Rounds to play. Default: as many as the run's configuration.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Evaluation seed. Default: that of the run's configuration.")
+    ] = None,
+    as_json: AsJson = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="Replace the episodes.csv of a finished run; only with the default rounds.")
+    ] = False,
+) -> None:
+    """Play rounds with a trained policy, noise off, and print how they ended."""
+    policy, config, record = load_run(run_dir)
+    own_rounds = config.evaluation.episodes, config.evaluation.seed
+    episodes = own_rounds[0] if episodes is None else episodes
+    seed = own_rounds[1] if seed is None else seed
+    if seed == record["seed"]:
+        raise ConfigError(f"--seed {seed} is the run's training seed: its policy has seen these worlds; choose another")
+    if write and record["status"] != "finished":
+        raise ConfigError(f"--write needs a finished run; the status of {run_dir} is {record['status']}")
+    if write and (episodes, seed) != own_rounds:
+        flags = f"--episodes {own_rounds[0]} --seed {own_rounds[1]}"
+        raise ConfigError(f"--write needs the rounds of the run's configuration: {flags}")
+    if record["status"] == "diverged":
+        typer.echo("warning: this run diverged; its policy is the last one of its training", err=True)
+    rounds = play_rounds(policy, config, episodes, seed)
+    closure = config.reward.closure
+    own = summarise_run(rounds, closure)
+    scenario = config.scenario
+    result = {
+        "method": config.reward.name,
+        "speed_ratio": scenario.speed_ratio,
+        "pursuers": scenario.pursuers,
+        "obstacles": scenario.obstacles,
+        "scene": scenario.scene,
+        "train_seed": record["seed"],
+        "eval_seed": seed,
+        "episodes": episodes,
+        "closure": closure,
+        "success": own.success,
+        "success_low": own.success_interval.low,
+        "success_high": own.success_interval.high,
+        "mean_episode_length": own.mean_episode_length,
+        "success_all": summarise_run(rounds, "all").success,
+        "success_pursuers": summarise_run(rounds, "pursuers").success,
+        "sigma_c": own.sigma_c,
+        "policy_sha256": record["sha256"]["policy.safetensors"],
+    }
+    if write:
+        write_episodes(run_dir, rounds)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        print_pairs(result)

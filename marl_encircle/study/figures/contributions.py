@@ -1,0 +1,78 @@
+"""Figure 5: how evenly the pursuers contribute, with and without the individual contributing angle."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from marl_encircle.experiments.metrics import CellSummary, Estimate
+from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
+from marl_encircle.study.figures.curves import series_of
+from marl_encircle.study.paper import label
+
+METHODS = ("ours", "model_c")
+SETTINGS = tuple(Setting(1.1, pursuers, 1) for pursuers in (2, 3, 4, 5))
+
+
+@style()
+def draw_figure5(summaries: Mapping[Cell, CellSummary]) -> Figure:
+    """Draw sigma_c and success over the number of pursuers, with intervals over the training seeds.
+
+    :param summaries: of the cells that have finished runs, under each method's own rule
+    """
+    figure = Figure((WIDTH, 2.6))
+    spread, success = figure.subplots(1, 2)
+    figure.subplots_adjust(left=0.07, right=0.985, top=0.9, bottom=0.295, wspace=0.2)
+    handles = _draw_panel(spread, summaries, lambda summary: summary.sigma_c, 1.0)
+    _draw_panel(success, summaries, lambda summary: summary.success, 100.0)
+    write_letter(spread, "a", "spread of the contributing angles")
+    write_letter(success, "b", "success")
+    spread.set_ylabel(r"$\sigma_c$ [rad]")
+    spread.set_ylim(bottom=0.0)
+    success.set(ylabel="success S [%]", ylim=(-2, 102), yticks=range(0, 101, 20))
+    put_below(figure, handles, "mean over the training seeds and its 95 % interval; one seed has no interval")
+    return figure
+
+
+def _draw_panel(
+    axes: Axes, summaries: Mapping[Cell, CellSummary], value: Callable[[CellSummary], Estimate], scale: float
+) -> list[Artist]:
+    """Draw one figure of merit of all methods; return what is to be in the legend."""
+    handles: list[Artist] = []
+    missing = []
+    for place, method in enumerate(METHODS):
+        settings = [setting for setting in SETTINGS if Cell(method, setting) in summaries]
+        if settings:
+            estimates = [value(summaries[Cell(method, setting)]) for setting in settings]
+            shift = 0.1 * (place - (len(METHODS) - 1) / 2)
+            handles.append(_draw_method(axes, method, [s.pursuers + shift for s in settings], estimates, scale))
+        if len(settings) < len(SETTINGS):
+            absent = ", ".join(str(setting.pursuers) for setting in SETTINGS if setting not in settings)
+            missing.append(f"{label(method)}, n = {absent}: not run")
+    axes.set(xlim=(1.6, 5.4), xticks=[setting.pursuers for setting in SETTINGS], xlabel="number of pursuers n")
+    axes.grid(axis="y")
+    if not handles:
+        say(axes, "not run")
+    elif missing:
+        note(axes, "\n".join(missing))
+    return handles
+
+
+def _draw_method(
+    axes: Axes, method: str, places: Sequence[float], estimates: Sequence[Estimate], scale: float
+) -> Artist:
+    """Draw one method's means, joined, with their intervals."""
+    series = series_of(method)
+    colour = rgb(series.colour)
+    means = [scale * estimate.mean for estimate in estimates]
+    for place, estimate in zip(places, estimates, strict=True):
+        if estimate.interval is not None:
+            ends = [scale * end for end in estimate.interval]
+            axes.plot([place, place], ends, "_-", color=colour, linewidth=0.9, markersize=5, zorder=3)
+    (line,) = axes.plot(places, means, series.marker, color=colour, markersize=4.5, zorder=4, label=label(method))
+    line.set(linestyle="-", linewidth=1.0)
+    if series.dashes:
+        line.set_dashes(series.dashes)
+    return line

@@ -1,0 +1,158 @@
+"""Figure 4: success over training, from the learning curves of runs."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from marl_encircle.envs.palette import SERIES, Series
+from marl_encircle.experiments.metrics import share_interval
+from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
+from marl_encircle.study.paper import label
+
+Array = NDArray[np.float64]
+
+FIGURE4_METHODS = ("ours", "model_b", "ma2019")
+"""What the paper compares."""
+
+ALL_METHODS = ("ours", "model_b", "ma2019", "model_a", "model_c")
+"""In the order of ``SERIES``; others come after them by name."""
+
+SETTINGS = (Setting(1.1, 3, 0), Setting(1.1, 3, 1))
+
+
+class Curve(NamedTuple):
+    """The learning curve of one run. P points."""
+
+    world_steps: NDArray[np.int64]
+    """When the rounds were played, (P,)."""
+    success: Array
+    """Share of them that the method's own rule counts as a success, (P,)."""
+
+
+class Band(NamedTuple):
+    """The curves of one method in one setting. S training seeds, P points."""
+
+    world_steps: NDArray[np.int64]
+    """At which all seeds have a point, (P,)."""
+    success: Array
+    """Of each seed, (S, P)."""
+    low: Array | None
+    """Lower end of the mean's interval, (P,); None with one seed."""
+    high: Array | None
+    """Upper end, (P,)."""
+
+    @property
+    def mean(self) -> Array:
+        """Over the seeds, (P,)."""
+        mean: Array = self.success.mean(axis=0)
+        return mean
+
+
+def curve_from_csv(text: str) -> Curve:
+    """Read ``progress.csv``.
+
+    :param text: content of the file
+    :raises ValueError: without the columns ``world_steps`` and ``success``, or for what is no number in them
+    """
+    rows = list(csv.DictReader(io.StringIO(text)))
+    try:
+        steps = np.array([int(row["world_steps"]) for row in rows], np.int64)
+        return Curve(steps, np.array([float(row["success"]) for row in rows]))
+    except (KeyError, TypeError) as error:
+        raise ValueError("world_steps and success must be in every line") from error
+
+
+def band_of(curves: Sequence[Curve], rounds: int) -> Band:
+    """Gather the curves of all seeds at the steps that they have in common.
+
+    :param curves: one or more
+    :param rounds: that were played at each point; see :func:`~marl_encircle.experiments.metrics.share_interval`
+    """
+    steps = np.array(sorted(set.intersection(*(set(curve.world_steps.tolist()) for curve in curves))), np.int64)
+    success = np.stack([curve.success[np.isin(curve.world_steps, steps)] for curve in curves])
+    intervals = [interval for point in success.T if (interval := share_interval(point.tolist(), rounds))]
+    if not intervals:
+        return Band(steps, success, None, None)
+    low, high = np.array(intervals).T
+    return Band(steps, success, low, high)
+
+
+def series_of(method: str, methods: Sequence[str] = ()) -> Series:
+    """Return how a method's curve looks: the same in every figure.
+
+    :param methods: all methods of the figure, which give those that the paper lacks their places
+    """
+    order = [*ALL_METHODS, *sorted(set(methods) - set(ALL_METHODS))]
+    return SERIES[order.index(method) % len(SERIES)]
+
+
+@style()
+def draw_figure4(
+    bands: Mapping[Cell, Band], methods: Sequence[str] = FIGURE4_METHODS, aliases: Mapping[Cell, Cell] | None = None
+) -> Figure:
+    """Draw success over world steps: mean, interval and every seed, one panel without and one with an obstacle.
+
+    :param bands: of the cells that have runs
+    :param methods: to show, the most important one first
+    :param aliases: cell -> the cell whose runs it shares; it is named, not drawn again
+    """
+    figure = Figure((WIDTH, 2.7))
+    all_axes = figure.subplots(1, len(SETTINGS), sharey=True)
+    figure.subplots_adjust(left=0.07, right=0.985, top=0.91, bottom=0.285, wspace=0.11)
+    shown: dict[str, Artist] = {}
+    for axes, letter, setting in zip(all_axes, "ab", SETTINGS, strict=True):
+        present = [method for method in methods if Cell(method, setting) in bands]
+        for method in reversed(present):
+            shown[method] = _draw_band(axes, bands[Cell(method, setting)], method, methods)
+        _write_missing(axes, setting, [method for method in methods if method not in present], aliases or {}, present)
+        _arrange(axes)
+        title = "no obstacle" if setting.obstacles == 0 else "one obstacle"
+        write_letter(axes, letter, f"{title}, n = {setting.pursuers}, λ = {setting.speed_ratio:g}")
+    all_axes[0].set_ylabel("success S [%]")
+    handles = [shown[method] for method in methods if method in shown]
+    put_below(figure, handles, "thick: mean over the training seeds; thin: each seed; shaded: 95 % interval")
+    return figure
+
+
+def _draw_band(axes: Axes, band: Band, method: str, methods: Sequence[str]) -> Artist:
+    """Draw one method; return the line for the legend."""
+    series = series_of(method, methods)
+    steps, colour = band.world_steps / 1e6, rgb(series.colour)
+    for seed in band.success:
+        axes.plot(steps, 100 * seed, color=colour, linewidth=0.4, alpha=0.55, zorder=2)
+    if band.low is not None and band.high is not None:
+        axes.fill_between(steps, 100 * band.low, 100 * band.high, color=colour, alpha=0.16, linewidth=0, zorder=1)
+    (line,) = axes.plot(steps, 100 * band.mean, color=colour, zorder=4, label=label(method))
+    if series.dashes:
+        line.set_dashes(series.dashes)
+    return line
+
+
+def _write_missing(
+    axes: Axes, setting: Setting, missing: Sequence[str], aliases: Mapping[Cell, Cell], present: Sequence[str]
+) -> None:
+    """Say what is not drawn and why."""
+    lines = []
+    for method in missing:
+        owner = aliases.get(Cell(method, setting))
+        shares = owner is not None and owner.method in present
+        lines.append(f"{label(method)}: {f'runs of {label(owner.method)}' if owner and shares else 'not run'}")
+    if not present:
+        say(axes, "not run")
+    elif lines:
+        note(axes, "\n".join(lines))
+
+
+def _arrange(axes: Axes) -> None:
+    axes.set(ylim=(-2, 102), yticks=range(0, 101, 20), xlabel="training [million world steps]")
+    axes.margins(x=0.01)
+    axes.set_xlim(left=0.0)
+    axes.grid(axis="y")

@@ -1,0 +1,120 @@
+"""From the runs of a grid to the files of all figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from marl_encircle import files
+from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.grid import Grid
+from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.metrics import CellSummary, summarise_cell
+from marl_encircle.experiments.records import MAX_FILE, Cell, Run, read_record, run_path
+from marl_encircle.replays.replay import record_round
+from marl_encircle.study.figures import contributions, curves
+from marl_encircle.study.figures.canvas import encode
+from marl_encircle.study.figures.contributions import draw_figure5
+from marl_encircle.study.figures.curves import ALL_METHODS, Band, band_of, curve_from_csv, draw_figure4
+from marl_encircle.study.figures.rounds import METHOD, PLACES, Column, Place, choose_round, draw_figure6
+from marl_encircle.study.figures.situations import draw_figure1, draw_figure3
+
+
+def write_figures(grid: Grid, results: str | Path) -> list[Path]:
+    """Draw Figures 1 and 3 to 6 from the runs of a grid into ``results/figures``, as SVG, PDF and PNG.
+
+    What the grid does not ask for is not shown; what it asks for and is not there, is "not run".
+
+    :return: the files written
+    :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
+    :raises DamagedFileError: if a run there is not what its record says
+    """
+    folder, written = Path(results) / "figures", []
+    for name, figure in draw_figures(grid, Path(results) / "runs").items():
+        for suffix, data in encode(figure).items():
+            files.write_bytes(folder / f"{name}.{suffix}", data)
+            written.append(folder / f"{name}.{suffix}")
+    return written
+
+
+def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
+    """Return every figure by name.
+
+    :param folder: of all runs
+    """
+    runs = runs_of(grid, folder)
+    bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
+    asked = {job.config.cell for job in grid.jobs} | set(grid.aliases)
+    methods = {cell.method for cell in asked if cell.setting in curves.SETTINGS}
+    others = sorted(methods - set(ALL_METHODS))
+    return {
+        "figure1": draw_figure1(),
+        "figure3": draw_figure3(),
+        "figure4": draw_figure4(bands, aliases=grid.aliases),
+        "figure4_all": draw_figure4(bands, [*(m for m in ALL_METHODS if m in methods), *others], grid.aliases),
+        "figure5": draw_figure5(_summaries(runs)),
+        "figure6": draw_figure6([_column(place, runs, folder) for place in PLACES]),
+    }
+
+
+def read_bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
+    """Read the learning curves of the finished runs.
+
+    :param folder: of all runs
+    :raises DamagedFileError: for a curve that is not what its run wrote
+    """
+    by_cell: dict[Cell, list[curves.Curve]] = {}
+    rounds: dict[Cell, int] = {}
+    for run in runs:
+        if run.status == "finished":
+            path = folder / run_path(run.cell, run.seed)
+            record = read_record(path)
+            data = files.read_bytes(
+                path / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE
+            )
+            try:
+                curve = curve_from_csv(data.decode())
+            except ValueError as error:
+                raise files.DamagedFileError(path / "progress.csv", str(error)) from error
+            by_cell.setdefault(run.cell, []).append(curve)
+            rounds[run.cell] = record["config"]["evaluation"]["curve_episodes"]
+    return {cell: band_of(found, rounds[cell]) for cell, found in by_cell.items()}
+
+
+def _summaries(runs: Sequence[Run]) -> Mapping[Cell, CellSummary]:
+    """Summarise the finished runs of Figure 5's cells under each method's own rule."""
+    summaries = {}
+    for cell in (Cell(method, setting) for method in contributions.METHODS for setting in contributions.SETTINGS):
+        found = [run for run in runs if run.cell == cell and run.status == "finished"]
+        closure = found[0].closure if found else None
+        if closure is not None:
+            summaries[cell] = summarise_cell({run.seed: run.episodes for run in found}, closure)
+    return summaries
+
+
+def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
+    """Replay the round of a place: of the first training seed, chosen by rule.
+
+    Where no policy was trained in a scene, that of single discs is put there as it is.
+    """
+    cells = [Cell(METHOD, place.setting), Cell(METHOD, place.setting._replace(scene="random"))]
+    found = [run for cell in cells for run in runs if run.cell == cell and run.status == "finished"]
+    if not found:
+        return Column(place.title, None, note="not run")
+    run = found[0]
+    policy, config, _ = load_run(folder / run_path(run.cell, run.seed))
+    rounds, evaluation, scene, note = run.episodes, config.evaluation, place.setting.scene, ""
+    if run.cell.setting.scene != scene:
+        there = config.model_copy(update={"scenario": replace(config.scenario, scene=scene)})
+        rounds = tuple(play_rounds(policy, there, evaluation.episodes, evaluation.seed))
+        note = "(trained with discs)"
+    choice = choose_round(rounds, config.reward.closure)
+    if choice is None:
+        return Column(place.title, None, note="no round solved")
+    replay = record_round(policy, config, choice.round, evaluation.seed, scene)
+    recorded = rounds[choice.round].success_step(config.reward.closure)
+    if replay.success_step != recorded:  # evaluated on a processor that rounds otherwise
+        note = f"(step {recorded} when evaluated)"
+    return Column(place.title, replay, choice, note)

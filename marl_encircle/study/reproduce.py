@@ -1,0 +1,97 @@
+"""The whole road for a grid: train what is missing, evaluate what is missing, render the tables."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from marl_encircle import files
+from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.executors import Executor
+from marl_encircle.experiments.grid import Grid, load_grid
+from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.sweep import Progress, sweep
+from marl_encircle.experiments.train import run_folder, write_episodes
+from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, render_table1, render_tables
+
+TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
+
+
+class Reproduction(NamedTuple):
+    """What had to be done, in runs."""
+
+    trained: int
+    evaluated: int
+    reused: int
+    sweep: Progress
+
+
+def reproduce(
+    grid_name: str,
+    results: str | Path,
+    n_workers: int,
+    report: Callable[[Progress], None] | None = None,
+    executor: Executor | None = None,
+) -> Reproduction:
+    """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
+
+    A run whose rounds had to be played again counts as evaluated, not as reused. Arguments are those of ``sweep``.
+
+    :raises ConfigError: for a grid that is not allowed
+    :raises DamagedFileError: if a run there is not what its record says
+    """
+    grid = load_grid(grid_name)
+    runs = Path(results) / "runs"
+    progress = sweep(grid.jobs, runs, n_workers, report, executor)
+    evaluated = 0
+    for job in grid.jobs:
+        folder = run_folder(job.config, job.seed, runs)
+        if (folder / "run.json").exists() and not (folder / "episodes.csv").exists():
+            policy, config, record = load_run(folder)
+            if record["status"] == "finished":
+                e = config.evaluation
+                write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed))
+                evaluated += 1
+    write_tables(grid, results)
+    trained = progress.done + progress.diverged - progress.reused
+    return Reproduction(trained, evaluated, progress.reused - evaluated, progress)
+
+
+def write_tables(grid: Grid, results: str | Path) -> list[Path]:
+    """Render the tables from the runs of a grid; a former table of other settings goes when there is none now.
+
+    :return: the files written
+    :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
+    :raises DamagedFileError: if a run there is not what its record says
+    """
+    texts = render(grid, results)
+    for name in OTHER_TABLES:
+        if f"tables/{name}" not in texts:
+            (Path(results) / "tables" / name).unlink(missing_ok=True)
+    for name, text in texts.items():
+        files.write_text(Path(results) / name, text)
+    return [Path(results) / name for name in texts]
+
+
+def render(grid: Grid, results: str | Path) -> dict[str, str]:
+    """Return the tables of a grid: path below ``results`` -> text. Nothing is written.
+
+    :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
+    :raises DamagedFileError: if a run there is not what its record says
+    """
+    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
+    runs = runs_of(grid, Path(results) / "runs")
+    texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
+    return {f"tables/{name}": text for name, text in texts.items()}
+
+
+def options_of(method: str) -> MethodOptions:
+    """Return the row of Table 1 that a method's reward configuration amounts to."""
+    reward = load_config(method).reward
+    active = reward.build().active
+    return MethodOptions(
+        two_stage=reward.two_stage,
+        obstacle_assisted=reward.closure == "all" and "obstacle_angle" in active,
+        individual_contributing_angle="contributing_angle" in active,
+    )

@@ -1,0 +1,244 @@
+"""Tables 1-4 beside the paper's numbers, from run folders; no clocks, so the same runs give the same bytes.
+
+All functions are pure: they take the records of runs and give texts by file name. Markdown and LaTeX have the paper's
+layout; CSV has one line for each cell, with all numbers.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from marl_encircle.experiments.records import Cell, Run
+from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of
+from marl_encircle.study.differences import difference_table, render_differences
+from marl_encircle.study.paper import PaperResult, label, paper_results, rank
+from marl_encircle.study.paper_layout import LAYOUTS, notes_on, seeds_of, success_and_length, wide
+from marl_encircle.study.typeset import (
+    DASH,
+    Styled,
+    Table,
+    Text,
+    estimate_columns,
+    latex,
+    markdown,
+    setting_columns,
+    to_csv,
+)
+
+OTHER_TABLES = ("table_other.md", "table_other.csv")
+"""Of the cells whose settings Tables 2-4 do not have; only where there are such."""
+
+_TABLE1 = "Experimental model options"
+_COMMON = "All methods under the common closure rule: pursuers and obstacles"
+_OTHER = "Settings that Tables 2-4 do not have"
+_OTHER_HEADER = ["Method", "λ", "n", "m", "Scene", "S [95 % interval] / MEL", "Training seeds"]
+_CELL_NOTE: Text = (
+    "Cells: S [95 % interval] / MEL of this study. Rows ",
+    Styled("paper", "italic"),
+    ": S / MEL as the paper reports them.",
+)
+_COMMON_CELL_NOTE = "Cells: S [95 % interval] / MEL of this study; the paper has no such table."
+_OWN_RULE_NOTE = (
+    "S: share of the evaluation rounds that end enclosed, in %, each method under its own closure rule (Ma and Model A:"
+    " pursuers alone; Models B and C and Ours: pursuers and obstacles)."
+)
+_COMMON_RULE_NOTE = (
+    "S: share of the evaluation rounds in which pursuers and obstacles together enclose the target, in %. Ma and Model"
+    " A are trained to enclose it with the pursuers alone."
+)
+
+
+class MethodOptions(NamedTuple):
+    """Row of Table 1.
+
+    :param two_stage: the lion's strategy: contraction only once the target is nearly enclosed
+    :param obstacle_assisted: obstacles count for the enclosure and are rewarded
+    :param individual_contributing_angle: each pursuer is rewarded for its own contributing angle
+    """
+
+    two_stage: bool
+    obstacle_assisted: bool
+    individual_contributing_angle: bool
+
+
+def render_tables(
+    runs: Iterable[Run],
+    aliases: Mapping[Cell, Cell] | None = None,
+    asked: Iterable[Cell] = (),
+    frozen: str | None = None,
+) -> dict[str, str]:
+    """Tables 2-4, the same results under the common closure rule, the paired differences, and other settings' results.
+
+    :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart
+    :param aliases: cell -> the cell whose runs it shares when it has none of its own
+    :param asked: cells that are shown in the paper's settings even if they have no runs
+    :param frozen: commit in which scenario and recipe were frozen, for a note
+    :return: file name -> text
+    :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
+    """
+    by_cell = gather(runs, aliases or {})
+    reported = paper_results()
+    cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
+    others = _by_method(by_cell.keys() - set(cells))
+    frozen_note = _frozen_note(frozen)
+    rendered: dict[str, str] = {}
+    for name, paper in reported.items():
+        results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
+        rendered |= _texts(_main_table(name, results, paper, frozen_note))
+        rendered[f"{name}.csv"] = to_csv([_record(result, paper.get(result.cell)) for result in results])
+    rendered |= _common_table(cells, by_cell, reported, frozen_note)
+    if others:
+        results = [result_of(cell, by_cell[cell]) for cell in others]
+        other = _other_table(results, frozen_note)
+        rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
+        rendered["table_other.csv"] = to_csv([_record(result, None) for result in results])
+    return rendered | render_differences(cells, by_cell, frozen_note)
+
+
+def render_table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> dict[str, str]:
+    """Table 1: what each model has, from its resolved reward config.
+
+    :param options: method -> its options, in the order of the rows
+    :param frozen: as in ``render_tables``
+    :return: file name -> text
+    """
+    records = [
+        {"method": method, **{name: "yes" if has else "no" for name, has in row._asdict().items()}}
+        for method, row in options.items()
+    ]
+    return {**_texts(table1(options, frozen)), "table1.csv": to_csv(records)}
+
+
+def table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> Table:
+    """Table 1 as a table; see :func:`render_table1`."""
+    rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
+    header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
+    return Table("table1", _TABLE1, header, rows, _frozen_note(frozen))
+
+
+def main_tables(
+    runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[Cell], frozen: str | None = None
+) -> list[Table]:
+    """Tables 2-4 and, where there are any, the results of other settings; then the paired differences.
+
+    What is in them is what :func:`render_tables` writes, whose parameters these are.
+    """
+    by_cell = gather(runs, aliases)
+    reported = paper_results()
+    cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
+    others = _by_method(by_cell.keys() - set(cells))
+    note = _frozen_note(frozen)
+    tables = [
+        _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, note)
+        for name, paper in reported.items()
+    ]
+    if others:
+        tables.append(_other_table([result_of(cell, by_cell[cell]) for cell in others], note))
+    return [*tables, difference_table(cells, by_cell, note)]
+
+
+def _texts(table: Table) -> dict[str, str]:
+    """Write one of the paper's tables in Markdown and LaTeX."""
+    title = f"Table {table.name.removeprefix('table')}: {table.title}"
+    return {
+        f"{table.name}.md": markdown(title, table.header, table.rows, table.notes),
+        f"{table.name}.tex": latex(table.name, table.title, table.header, table.rows, table.notes),
+    }
+
+
+def _frozen_note(frozen: str | None) -> list[str]:
+    return [] if frozen is None else [f"Scenario and recipe frozen in commit {frozen[:12]}."]
+
+
+def _ordered(paper: Iterable[Cell], others: Iterable[Cell]) -> list[Cell]:
+    """Sort the paper's cells and the other ones that are in the same settings."""
+    paper = set(paper)
+    settings = {cell.setting for cell in paper}
+    return _by_method(paper | {cell for cell in others if cell.setting in settings})
+
+
+def _by_method(cells: Iterable[Cell]) -> list[Cell]:
+    """Sort cells by method, the paper's first, then by setting."""
+    return sorted(cells, key=lambda cell: (rank(cell.method), cell))
+
+
+def _main_table(
+    name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], frozen_note: Sequence[str]
+) -> Table:
+    """One of Tables 2-4, each method under its own closure rule."""
+    layout = LAYOUTS[name]
+    header, rows, seeds = wide(layout, results, paper)
+    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper), *seeds, *frozen_note]
+    return Table(name, layout.title, header, rows, notes)
+
+
+def _common_table(
+    cells: Sequence[Cell],
+    runs: Mapping[Cell, CellRuns],
+    reported: Mapping[str, Mapping[Cell, PaperResult]],
+    frozen_note: Sequence[str],
+) -> dict[str, str]:
+    """All cells of Tables 2-4 under the common closure rule."""
+    results = [result_of(cell, runs.get(cell), "all") for cell in cells]
+    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, {}), *frozen_note]
+    sections = [f"# {_COMMON}\n\n" + "".join(f"- {note}\n" for note in notes)]
+    for name, paper in reported.items():
+        settings = {cell.setting for cell in paper}
+        layout = LAYOUTS[name]
+        header, rows, seeds = wide(layout, [result for result in results if result.cell.setting in settings], {})
+        sections.append(markdown(layout.title, header, rows, seeds, level=2))
+    every = {cell: result for paper in reported.values() for cell, result in paper.items()}
+    return {
+        "table_common_rule.md": "\n".join(sections),
+        "table_common_rule.csv": to_csv([_record(result, every.get(result.cell)) for result in results]),
+    }
+
+
+def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> Table:
+    """Cells of other settings, a line for each."""
+    rows = [
+        [
+            label(result.cell.method) + (f" (runs of {label(owner)})" if (owner := _owner(result)) else ""),
+            *(f"{value:g}" for value in result.cell.setting[:3]),
+            result.cell.setting.scene,
+            success_and_length(result),
+            seeds_of(result),
+        ]
+        for result in results
+    ]
+    notes = [_OWN_RULE_NOTE, *notes_on(results, {}), *frozen_note]
+    return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
+
+
+def _owner(result: Result) -> str | None:
+    """Name the method whose runs these are, if not the cell's own."""
+    return result.runs.runs_of if result.runs else None
+
+
+def _record(result: Result, paper: PaperResult | None) -> dict[str, str]:
+    """Write a cell in CSV: empty where there is nothing."""
+    summary, runs = result.summary, result.runs
+    # sigma_c is recorded under the method's own rule, up to its own success: the other rule has none.
+    own = summary if runs and result.closure == runs.closure else None
+    return {
+        "method": result.cell.method,
+        **setting_columns(result.cell.setting),
+        "closure": result.closure or "",
+        "result": result.status,
+        **estimate_columns("success_percent", summary and summary.success, 100),
+        **estimate_columns("mean_episode_length", summary and summary.mean_episode_length, 1),
+        **estimate_columns("sigma_c", own and own.sigma_c, 1),
+        **estimate_columns("sigma_c_solved", own and own.sigma_c_solved, 1),
+        "seeds": str(len(runs.finished) if runs else 0),
+        "training_seeds": " ".join(map(str, runs.finished)) if runs else "",
+        **{status.replace(" ", "_"): str(len(runs.others[status]) if runs else 0) for status in OTHER_STATUSES},
+        "runs_of": _owner(result) or "",
+        "paper_success_percent": _paper_number(paper, paper and paper.success_percent),
+        "paper_mean_episode_length": _paper_number(paper, paper and paper.mean_episode_length),
+    }
+
+
+def _paper_number(paper: PaperResult | None, value: float | None) -> str:
+    """Write the paper's number, its dash, or nothing where it does not have the cell."""
+    if paper is None:
+        return ""
+    return DASH if value is None else f"{value:.2f}"

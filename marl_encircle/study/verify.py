@@ -1,0 +1,100 @@
+"""Are the committed results those of this code? Every policy plays its rounds again, every table is rendered again.
+
+On the processor that a run was made on every round must be equal in every figure. Another one rounds differently, and a
+round may then take another course: there 99.5 % of the rounds must end alike, and every cell's S must lie within the
+99 % binomial interval of the S that is recorded.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from marl_encircle import files
+from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.grid import Grid
+from marl_encircle.experiments.metrics import wilson_interval
+from marl_encircle.experiments.provenance import cpu_model
+from marl_encircle.experiments.records import Cell, Episode, episodes_from_csv
+from marl_encircle.experiments.train import run_folder
+from marl_encircle.study.reproduce import render
+
+EQUAL_SHARE = 0.995
+CONFIDENCE = 0.99
+
+
+class Verification(NamedTuple):
+    """What was found.
+
+    :param rounds: rounds played again
+    :param equal: those that ended as recorded; on the run's own processor also with the same figures
+    :param cells_off: cells whose S lies outside the interval
+    :param exact: whether all runs were made on this processor, so that every round must be equal
+    :param changed: tables that are not what the runs give
+    """
+
+    rounds: int
+    equal: int
+    cells_off: int
+    exact: bool
+    changed: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether there are results and they are those of this code."""
+        enough = self.equal == self.rounds if self.exact else self.equal >= EQUAL_SHARE * self.rounds
+        return self.rounds > 0 and enough and not self.cells_off and not self.changed
+
+
+def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] | None = None) -> Verification:
+    """Play every finished run of a grid again and render its tables; nothing is written.
+
+    :param results: folder of ``runs/`` and ``tables/``
+    :param report: called with the number of runs verified and of all
+    :raises DamagedFileError: if a run is not what its record says
+    """
+    folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
+    folders = [folder for folder in folders if (folder / "episodes.csv").exists()]
+    rounds = equal = 0
+    exact = True
+    successes: dict[Cell, list[tuple[bool, bool]]] = defaultdict(list)
+    for done, folder in enumerate(folders, start=1):
+        policy, config, record = load_run(folder)
+        recorded = episodes_from_csv((folder / "episodes.csv").read_text(encoding="utf-8"))
+        played = play_rounds(policy, config, len(recorded), config.evaluation.seed)
+        same_processor = record["cpu"] == cpu_model()
+        exact &= same_processor
+        rounds += len(recorded)
+        equal += count_equal(recorded, played, same_processor)
+        closure = config.reward.closure
+        successes[config.cell] += [
+            (then.success_step(closure) is not None, now.success_step(closure) is not None)
+            for then, now in zip(recorded, played, strict=True)
+        ]
+        if report is not None:
+            report(done, len(folders))
+    off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())
+    changed = [name for name, text in render(grid, results).items() if _read(Path(results) / name) != text.encode()]
+    return Verification(rounds, equal, off, exact, tuple(changed))
+
+
+def count_equal(recorded: Sequence[Episode], played: Sequence[Episode], exact: bool) -> int:
+    """Count the rounds that ended alike.
+
+    :param exact: all figures must be the same, not only the steps at which the closure rules held
+    """
+    pairs = zip(recorded, played, strict=True)
+    if exact:
+        return sum(then == now for then, now in pairs)
+    return sum((then.step_all, then.step_pursuers) == (now.step_all, now.step_pursuers) for then, now in pairs)
+
+
+def is_off(recorded: Sequence[bool], played: Sequence[bool]) -> bool:
+    """Whether a cell's S now lies outside the 99 % binomial interval of the S that is recorded."""
+    interval = wilson_interval(sum(recorded) / len(recorded), len(recorded), CONFIDENCE)
+    return not interval.low <= sum(played) / len(played) <= interval.high
+
+
+def _read(path: Path) -> bytes | None:
+    return files.read_bytes(path) if path.exists() else None

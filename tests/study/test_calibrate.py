@@ -1,0 +1,181 @@
+"""Calibration: the protocol as it is written, on trainings that are given or tiny."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import TINY, everything_in, train_in_this_process
+
+from marl_encircle.experiments import grid as grids
+from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.sweep import Progress
+from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.study import calibrate as calibration
+from marl_encircle.study.calibrate import (
+    MAX_SCENARIOS,
+    Protocol,
+    Result,
+    Trial,
+    calibrate,
+    load_protocol,
+    name_of,
+    paper_cells,
+    render,
+)
+
+PROTOCOL = """\
+reward: ours
+profile: smoke
+scenario: default
+settings:
+  - {speed_ratio: 1.1, pursuers: 3, obstacles: 0}
+seeds: [910]
+neighbours:
+  - {acceleration: 3}
+  - {contacts: hard}
+  - {wall_weight: 0.5}
+combinations: 2
+"""
+
+
+@pytest.fixture
+def protocol(tmp_path: Path) -> Protocol:
+    path = tmp_path / "protocol.yaml"
+    path.write_text(PROTOCOL)
+    return load_protocol(str(path))
+
+
+def with_distances(monkeypatch: pytest.MonkeyPatch, distances: Mapping[str, float]) -> list[str]:
+    """Give every scenario its distance in place of trainings; return the names in the order they are asked for."""
+    asked: list[str] = []
+
+    def measure(protocol: Protocol, changes: Mapping[str, Any], folder: Path) -> Trial:
+        asked.append(name_of(changes))
+        return Trial(changes, tuple(Result(90.0, 20.0) for _ in protocol.cells), distances[name_of(changes)])
+
+    monkeypatch.setattr(calibration, "sweep", lambda jobs, *_: Progress(total=len(jobs), done=len(jobs)))
+    monkeypatch.setattr(calibration, "_measure", measure)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("distances", "trials", "chosen"),
+    [
+        # The nearest neighbour is the best so far; the next is joined and stays; the third is farther than the centre
+        ([9, 5, 7, 12, {"acceleration=3,contacts=hard": 4}], 5, "acceleration=3,contacts=hard"),
+        # What does not come nearer is left out of what is tried next
+        (
+            [9, 5, 7, 8, {"acceleration=3,contacts=hard": 6, "acceleration=3,wall_weight=0.5": 3}],
+            6,
+            "acceleration=3,wall_weight=0.5",
+        ),
+        ([9, 9, 10, 11, {}], 4, "centre"),
+        ([9, 5, 10, 9, {}], 4, "acceleration=3"),
+    ],
+)
+def test_the_best_neighbours_are_joined(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    protocol: Protocol,
+    distances: Sequence[Any],
+    trials: int,
+    chosen: str,
+) -> None:
+    *single, joined = distances
+    names = ["centre", "acceleration=3", "contacts=hard", "wall_weight=0.5"]
+    asked = with_distances(monkeypatch, dict(zip(names, single, strict=True)) | joined)
+    result = calibrate(protocol, tmp_path / "out", 1)
+    assert asked == [*names, *joined]
+    assert len(result.trials) == trials
+    assert name_of(result.chosen.changes) == chosen
+    assert f"Chosen: {chosen}." in (tmp_path / "out" / "sensitivity.md").read_text()
+    config = load_config(scenario=tmp_path / "out" / "scenario.yaml").scenario
+    assert {field: getattr(config, field) for field in result.chosen.changes} == result.chosen.changes
+
+
+def test_no_more_combinations_are_tried_than_the_protocol_allows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, protocol: Protocol
+) -> None:
+    distances = {"centre": 9.0, "acceleration=3": 5.0, "contacts=hard": 7.0, "wall_weight=0.5": 8.0}
+    distances |= {"acceleration=3,contacts=hard": 6.0}
+    asked = with_distances(monkeypatch, distances)
+    calibrate(protocol.model_copy(update={"combinations": 1}), tmp_path, 1)
+    assert asked == list(distances)
+
+
+def test_the_distance_is_to_the_papers_cells(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, protocol: Protocol
+) -> None:
+    """Paper, Ours at ratio 1.1, n=3, m=0: 97.88 / 23.51."""
+    monkeypatch.setattr(grids, "load_config", _tiny)
+    train_in_this_process(monkeypatch)
+    one = protocol.model_copy(update={"neighbours": [], "combinations": 0})
+    result = calibrate(one, tmp_path, 1)
+    (ours,) = result.chosen.results
+    assert result.chosen.distance == pytest.approx(abs(ours.success - 97.88) + abs(ours.length - 23.51))
+    table = (tmp_path / "sensitivity.csv").read_text().splitlines()
+    assert table[1] == f"centre,{ours.success:.4f},{ours.length:.4f},{result.chosen.distance:.2f}"
+    assert table[2] == "the paper,97.8800,23.5100,"
+    before = everything_in(tmp_path)
+    assert calibrate(one, tmp_path, 1) == result
+    assert everything_in(tmp_path) == before
+    assert render(one, result)["sensitivity.md"] == (tmp_path / "sensitivity.md").read_text()
+
+
+def _tiny(*arguments: Any, **named: Any) -> Config:
+    return load_config(*arguments, **{**named, "overrides": TINY})
+
+
+def test_the_projects_protocol_is_allowed_and_holds_the_other_cells_out() -> None:
+    protocol = load_protocol("calibration")
+    assert 1 + len(protocol.neighbours) + protocol.combinations <= MAX_SCENARIOS == 16
+    assert protocol.cells == [Cell("ours", Setting(1.1, 3, 0)), Cell("ours", Setting(1.1, 2, 1))]
+    assert len(protocol.seeds) == 2
+
+
+def test_a_grid_is_no_protocol() -> None:
+    for name in ("all", "calibratio"):
+        with pytest.raises(ConfigError, match=r"neither a known name.*(known: calibration$|mean calibration\?)"):
+            load_protocol(name)
+
+
+def test_the_papers_cells_are_those_with_numbers() -> None:
+    cells = paper_cells()
+    assert cells[Cell("ours", Setting(1.1, 2, 1))] == Result(77.75, 29.48)
+    assert Cell("model_a", Setting(1.1, 2, 1)) not in cells
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("combinations: 2", "combinations: 13", "17 scenarios; at most 16 may be tried"),
+        ("pursuers: 3", "pursuers: 7", "the paper has no numbers of ours in"),
+        ("reward: ours", "reward: model_c", "the paper has no numbers of model_c in"),
+        ("{contacts: hard}", "{contacts: no}", "scenario.contacts must be one of soft, hard, off; got 'no'"),
+        ("{contacts: hard}", "{contact: hard}", "contact"),
+        ("{contacts: hard}", "{contacts: hard, acceleration: 3}", "neighbours"),
+        ("seeds: [910]", "seeds: []", "seeds"),
+        ("seeds: [910]", "seeds: [1000]", "seed must differ from evaluation.seed"),
+        ("seeds: [910]", "seed: [910]", "did you mean seeds"),
+        ("seeds: [910]", "seeds: [910, 911, 910]", "seeds.2: stands there twice; got 910"),
+        ("{contacts: hard}", "{pursuers: 4}", "neighbours.1.pursuers: belongs to the settings"),
+        ("{contacts: hard}", "{obstacles: 1}", "neighbours.1.obstacles: belongs to the settings"),
+        ("{contacts: hard}", "{speed_ratio: 1.2}", "neighbours.1.speed_ratio: belongs to the settings"),
+        ("{contacts: hard}", "{scene: tunnel}", "neighbours.1.scene: belongs to the settings"),
+        ("{contacts: hard}", "{contacts: soft}", "neighbours.1: contacts=soft is the same scenario as the centre"),
+        ("{contacts: hard}", "{acceleration: 3.0}", "neighbours.1: acceleration=3.0 is the same .* as neighbours.0"),
+        (
+            "obstacles: 0}",
+            "obstacles: 0}\n  - {speed_ratio: 1.1, pursuers: 3, obstacles: 0}",
+            "settings.1: stands there twice",
+        ),
+    ],
+)
+def test_a_protocol_that_cannot_be_carried_out_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "protocol.yaml"
+    assert old in PROTOCOL
+    path.write_text(PROTOCOL.replace(old, new))
+    with pytest.raises(ConfigError, match=message):
+        load_protocol(str(path))

@@ -1,0 +1,97 @@
+"""Verification: finds rounds that end otherwise and tables that the runs do not give, and writes nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_runs import TINY, copy_of_finished, everything_in
+
+from marl_encircle import files
+from marl_encircle.experiments.grid import Grid, Job
+from marl_encircle.experiments.records import Setting, episodes_from_csv, episodes_to_csv
+from marl_encircle.experiments.train import run_folder
+from marl_encircle.study import verify as verification
+from marl_encircle.study.reproduce import write_tables
+from marl_encircle.study.verify import Verification, is_off, verify
+
+GRID = Grid((Job("ours", Setting(1.1, 3, 1), 0, "smoke", overrides=TINY),), {})
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """One finished run and its tables."""
+    copy_of_finished(tmp_path / "runs")
+    write_tables(GRID, tmp_path)
+    return tmp_path
+
+
+def change_a_round(results: Path, **values: float) -> None:
+    """Change the first round of the run, as if another code had played it."""
+    folder = run_folder(GRID.jobs[0].config, 0, results / "runs")
+    first, *others = episodes_from_csv((folder / "episodes.csv").read_text())
+    data = episodes_to_csv([first._replace(**values), *others]).encode()
+    record = json.loads((folder / "run.json").read_text())
+    record["sha256"]["episodes.csv"] = files.sha256_bytes(data)
+    (folder / "episodes.csv").write_bytes(data)
+    files.write_json(folder / "run.json", record)
+    write_tables(GRID, results)
+
+
+def test_what_was_recorded_here_is_played_again_to_the_last_bit(results: Path) -> None:
+    before = everything_in(results)
+    seen = []
+    found = verify(GRID, results, lambda done, total: seen.append((done, total)))
+    assert found == Verification(rounds=8, equal=8, cells_off=0, exact=True, changed=())
+    assert found.passed
+    assert seen == [(1, 1)]
+    assert everything_in(results) == before
+
+
+def test_another_figure_of_a_round_is_found(results: Path) -> None:
+    change_a_round(results, return_mean=0.125)
+    found = verify(GRID, results)
+    assert (found.equal, found.cells_off, found.changed) == (7, 0, ())
+    assert not found.passed
+
+
+def test_another_processor_may_round_otherwise_but_not_end_otherwise(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verification, "cpu_model", lambda: "another")
+    change_a_round(results, return_mean=0.125)
+    assert verify(GRID, results) == Verification(rounds=8, equal=8, cells_off=0, exact=False, changed=())
+    change_a_round(results, step_pursuers=17)
+    found = verify(GRID, results)
+    assert found.equal == 7
+    assert not found.passed  # one of eight is more than 0.5 %
+
+
+def test_a_table_that_the_runs_do_not_give_is_found(results: Path) -> None:
+    table = results / "tables" / "table2.md"
+    table.write_text(table.read_text().replace("not run", "99.99", 1))
+    (results / "tables" / "table3.csv").unlink()
+    found = verify(GRID, results)
+    assert found.changed == ("tables/table2.md", "tables/table3.csv")
+    assert found.equal == found.rounds
+    assert not found.passed
+
+
+def test_nothing_is_no_proof(tmp_path: Path) -> None:
+    write_tables(GRID, tmp_path)
+    found = verify(GRID, tmp_path)
+    assert (found.rounds, found.changed) == (0, ())
+    assert not found.passed
+
+
+def test_a_cell_is_off_outside_the_99_percent_binomial_interval() -> None:
+    """S = 90 % of 1,000 rounds: Wilson's interval is 87.29 to 92.18 %."""
+    recorded = [True] * 900 + [False] * 100
+    for successes, off in ((872, True), (873, False), (921, False), (922, True)):
+        assert is_off(recorded, [True] * successes + [False] * (1000 - successes)) is off
+
+
+def test_one_round_in_two_hundred_may_end_otherwise_elsewhere() -> None:
+    assert Verification(1000, 995, 0, exact=False, changed=()).passed
+    assert not Verification(1000, 994, 0, exact=False, changed=()).passed
+    assert not Verification(1000, 999, 0, exact=True, changed=()).passed
+    assert not Verification(1000, 1000, 1, exact=False, changed=()).passed
