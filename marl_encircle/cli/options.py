@@ -12,7 +12,7 @@ from marl_encircle.experiments.yaml_files import ConfigError
 
 RewardOption = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
 ScenarioOption = Annotated[
-    str, typer.Option(help="The world's rules: a name such as default, or the path of a YAML file.")
+    str, typer.Option(help="The world's rules: default, paper (the study's), or the path of a YAML file.")
 ]
 # Those that are not given are the scenario's own.
 SpeedRatio = Annotated[

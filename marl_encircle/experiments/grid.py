@@ -105,7 +105,9 @@ class Grid(NamedTuple):
 
 
 def load_grid(name: str) -> Grid:
-    """Return the runs of a grid in the file's order, each once, none of a cell that shares another's.
+    """Return the runs of a grid, each once, none of a cell that shares another's.
+
+    The first seed of all cells comes first, else the file's order: a sweep that is stopped leaves every cell alike.
 
     :param name: a name in ``configs/paper/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
@@ -143,7 +145,7 @@ def load_grid(name: str) -> Grid:
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
-    return Grid(tuple(jobs), aliases, grid.frozen)
+    return Grid(tuple(sorted(jobs, key=lambda job: job.seed)), aliases, grid.frozen)
 
 
 @contextmanager

@@ -87,14 +87,14 @@ def test_a_users_method_is_given_by_path_from_the_grids_folder(tmp_path: Path, m
     for path in ("mine/idea.yaml", str(tmp_path / "mine" / "idea.yaml")):
         monkeypatch.chdir("/")
         grid = grid_of(tmp_path, GRID.format(method=path))
-        assert grid.jobs[2].config.reward.scale == 0.1
-        assert grid.jobs[2].config.cell == Cell("idea", ONE)
+        assert grid.jobs[1].config.reward.scale == 0.1
+        assert grid.jobs[1].config.cell == Cell("idea", ONE)
 
 
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
     for scale in (0.1, 0.2):
         (tmp_path / "idea.yaml").write_text(f"base: ours\nscale: {scale}\n")
-        assert grid_of(tmp_path, GRID.format(method="idea.yaml")).jobs[2].config.reward.scale == scale
+        assert grid_of(tmp_path, GRID.format(method="idea.yaml")).jobs[1].config.reward.scale == scale
 
 
 def test_two_methods_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -218,3 +218,11 @@ def test_a_job_on_the_command_line_is_the_same_run(monkeypatch: pytest.MonkeyPat
         "model_c", profile="smoke", fields={"speed_ratio": 1.25, "pursuers": 4, "obstacles": 2, "scene": "concave"}
     )
     assert job.config == expected
+
+
+def test_the_first_seeds_of_all_cells_come_first() -> None:
+    jobs = load_grid("all").jobs
+    assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
+    first = [job.config.cell for job in jobs if job.seed == 0]
+    assert set(first) == {job.config.cell for job in jobs}
+    assert first[0] == Cell("ma2019", Setting(1.1, 3, 0, "random"))

@@ -25,6 +25,7 @@ from marl_encircle.study.calibrate import (
     render,
 )
 
+ROOT = Path(__file__).parents[2]
 PROTOCOL = """\
 reward: ours
 profile: smoke
@@ -133,6 +134,13 @@ def test_the_projects_protocol_is_allowed_and_holds_the_other_cells_out() -> Non
     assert 1 + len(protocol.neighbours) + protocol.combinations <= MAX_SCENARIOS == 16
     assert protocol.cells == [Cell("ours", Setting(1.1, 3, 0)), Cell("ours", Setting(1.1, 2, 1))]
     assert len(protocol.seeds) == 2
+
+
+def test_the_studys_scenario_is_the_calibrations_outcome() -> None:
+    chosen = load_config("ours", scenario=str(ROOT / "results" / "calibration" / "scenario.yaml"))
+    assert load_config("ours", scenario="paper") == chosen
+    assert chosen != load_config("ours")
+    assert {job.scenario for job in grids.load_grid("all").jobs} == {"paper"}
 
 
 def test_a_grid_is_no_protocol() -> None:
