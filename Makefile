@@ -26,7 +26,7 @@ TRAIN   = $(CLI) train --reward $(REWARD) --speed-ratio $(SPEED_RATIO) --pursuer
 export OMP_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-sb3 check lint format format-check typecheck imports spelling \
+.PHONY: help setup test soak test-sb3 check lint format format-check typecheck imports spelling \
         train evaluate sweep tables figures report test-browser calibrate verify-results reproduce-tables bench tensorboard clean
 
 help:  ## list the targets and the variables
@@ -45,6 +45,9 @@ $(READY): pyproject.toml constraints.txt
 
 test: $(READY)  ## the tests (PYTEST_ARGS goes to pytest)
 	$(PYTHON) -m pytest -n 2 $(PYTEST_ARGS)
+
+soak: $(READY)  ## the promises that take long to see: kills, full disks, long sweeps; under 40 minutes
+	$(PYTHON) -m pytest -n 2 --timeout 1200 tests/soak $(PYTEST_ARGS)
 
 test-sb3: $(READY)  ## Stable-Baselines3's own tests on MADDPG and MATD3
 	$(PYTHON) tests/sb3_suite.py
