@@ -133,7 +133,10 @@ TERMS: dict[str, Callable[..., Array]] = {
     "encirclement_radius": encirclement_radius,
     "phase_difference": phase_difference,
 }
-"""Reward terms by name; a term takes a :class:`Transition` and returns (B, N)."""
+"""Reward terms by name; a term takes a :class:`Transition` and returns (B, N).
+
+One's own is added by assignment, ``TERMS["approach"] = approach``, before the configuration that names it is loaded.
+"""
 
 CONTRACTION_STAGE = frozenset({"contraction", "completion"})
 """Terms that a two-stage reward gives only from the stage threshold on (Eq. 11)."""
@@ -203,13 +206,19 @@ class Reward:
         return result
 
     def parts(self, t: Transition) -> dict[str, Array]:
-        """Return each term's share of the reward, (B, N) each."""
-        gate = None
+        """Return each term's share of the reward, (B, N) each.
+
+        :raises ValueError: if a term returns anything else
+        """
+        shape, gate = t.measure.target_distance.shape, None
         if self.two_stage:
             gate = t.enclosure.occupies(t.scenario.stage_threshold)[:, None]
         shares = {}
         for name, (weight, parameters) in self.active.items():
-            share = (self.scale * weight) * TERMS[name](t, **parameters)
+            value = TERMS[name](t, **parameters)
+            if getattr(value, "shape", None) != shape:
+                raise ValueError(f"terms.{name} must return an array (B, N), here {shape}; got {np.shape(value)}")
+            share = (self.scale * weight) * value
             shares[name] = share * gate if gate is not None and name in CONTRACTION_STAGE else share
         return shares
 

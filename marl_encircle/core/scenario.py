@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 
 from marl_encircle.core.dynamics import TARGETS
-from marl_encircle.core.scenes import SCENES
+from marl_encircle.core.scenes import SCENES, discs_of
 
 Extra = Literal["occupied_angle", "stage", "speed_ratio"]
 
@@ -151,7 +151,7 @@ class Scenario:
     @property
     def discs(self) -> int:
         """Number D of discs that the obstacles consist of."""
-        return self.obstacles * len(SCENES[self.scene]())
+        return self.obstacles * len(discs_of(self.scene))
 
     @property
     def units(self) -> int:
@@ -178,7 +178,7 @@ class Scenario:
     @property
     def _squared_radii(self) -> float:
         """Sum of the squared radii of all obstacles' discs [obstacle radii^2]."""
-        return self.obstacles * float((SCENES[self.scene]()[:, 2] ** 2).sum())
+        return self.obstacles * float((discs_of(self.scene)[:, 2] ** 2).sum())
 
     @property
     def solvable_without_obstacles(self) -> bool:

@@ -35,7 +35,25 @@ def _about_centre(x: Array, y: Array, radius: float) -> Array:
 
 
 SCENES: dict[str, Callable[[], Array]] = {"random": random, "concave": concave, "tunnel": tunnel}
-"""Each scene's obstacle: discs (L, 3) as x, y, radius about their centre [obstacle radii]."""
+"""Each scene's obstacle: discs (L, 3) as x, y, radius about their centre [obstacle radii].
+
+One's own is added by assignment, ``SCENES["cross"] = cross``, before the scenario that names it is made.
+"""
+
+
+def discs_of(scene: str) -> Array:
+    """Return the discs of a scene's obstacle, (L, 3).
+
+    :param scene: a name in ``SCENES``
+    :raises ValueError: if the scene's function returns anything else
+    """
+    discs = np.asarray(SCENES[scene](), np.float64)
+    if discs.ndim != 2 or discs.shape[1] != 3 or not len(discs):
+        raise ValueError(f"scene {scene!r:.80} must return discs (x, y, radius), (L, 3); got shape {discs.shape}")
+    fit = np.isfinite(discs).all(axis=1) & (discs[:, 2] > 0)
+    if not fit.all():
+        raise ValueError(f"scene {scene!r:.80} must return finite discs of positive radius; got {discs[fit.argmin()]}")
+    return discs
 
 
 @kernel

@@ -77,7 +77,7 @@ class Simulator:
         self.steps = np.zeros(n_worlds, np.int64)
         self._physics = physics_of(scenario)
         self._rays = geometry.half_circle(scenario.n_directions)
-        self._shape = scenes.SCENES[scenario.scene]()
+        self._shape = scenes.discs_of(scenario.scene)
         self._everywhere = np.arange(n_worlds)
         self._actions_shape = (n_worlds, scenario.pursuers, 2)
         self._difficulty: Difficulty = {}

@@ -206,6 +206,27 @@ def test_a_term_without_weight_is_never_called(monkeypatch: pytest.MonkeyPatch) 
         Reward({"time": 0.0}).parts(told())
 
 
+def test_a_term_of_ones_own_is_weighted_like_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    def approach(t: Transition, *, limit: float = 0.1) -> np.ndarray:
+        return np.minimum(t.former_measure.target_distance - t.measure.target_distance, limit)
+
+    monkeypatch.setitem(TERMS, "approach", approach)
+    t = told(target_distance=[0.4, 0.5, 0.25])
+    t = t._replace(former_measure=t.measure._replace(target_distance=np.array([[0.45, 0.4, 0.75]])))
+    parts = Reward({"time": 1.0, "approach": {"weight": 2.0, "limit": 0.3}}, scale=0.5).parts(t)
+    assert list(parts) == ["time", "approach"]
+    assert parts["approach"][0].tolist() == near(0.05, -0.1, 0.3)
+
+
+@pytest.mark.parametrize("value", [np.zeros(3), np.zeros((1, 1)), np.zeros((2, 3)), 0.0, [[0.0, 0.0, 0.0]]])
+def test_a_term_must_return_a_number_for_each_pursuer_of_each_world(
+    monkeypatch: pytest.MonkeyPatch, value: object
+) -> None:
+    monkeypatch.setitem(TERMS, "wrong", lambda t: value)
+    with pytest.raises(ValueError, match=r"terms\.wrong must return an array \(B, N\), here \(1, 3\); got "):
+        Reward({"wrong": 1.0}).parts(told())
+
+
 def test_without_obstacles_model_a_and_ours_earn_the_same() -> None:
     model_a = Reward({**OURS, "obstacle_angle": None}, closure="pursuers")
     sim, rng = Simulator(Scenario(obstacles=0), 64, 1), np.random.default_rng(1)

@@ -35,9 +35,36 @@ def test_the_registry_is_what_the_file_defines() -> None:
     defined = {
         name: f
         for name, f in vars(scenes).items()
-        if getattr(f, "__module__", None) == scenes.__name__ and not name.startswith("_") and name != "place"
+        if getattr(f, "__module__", None) == scenes.__name__ and not name.startswith("_")
     }
+    del defined["place"], defined["discs_of"]
     assert defined == SCENES
+
+
+def test_a_scene_of_ones_own_is_placed_like_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENES, "pair", lambda: np.array([[-1.0, 0.0, 0.5], [1.0, 0.0, 0.25]]))
+    s = drawn(Scenario(scene="pair", obstacles=2, obstacle_radius=0.1)).state
+    assert s.discs.shape == (200, 4, 3)
+    assert s.discs[:, :, 2] == pytest.approx(np.tile([0.05, 0.025, 0.05, 0.025], (200, 1)))
+    assert distances(s.discs, s.discs)[:, 0, 1] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("discs", "message"),
+    [
+        ([[0.0, 0.0]], r"scene 'wrong' must return discs \(x, y, radius\), \(L, 3\); got shape \(1, 2\)"),
+        ([0.0, 0.0, 1.0], r"scene 'wrong' .* got shape \(3,\)"),
+        (np.zeros((0, 3)), r"scene 'wrong' .* got shape \(0, 3\)"),
+        ([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], r"scene 'wrong' must return finite discs .* got \[1\. 0\. 0\.\]"),
+        ([[0.0, np.nan, 1.0]], r"scene 'wrong' must return finite discs"),
+    ],
+)
+def test_a_scene_that_returns_no_discs_is_refused_by_name(
+    monkeypatch: pytest.MonkeyPatch, discs: object, message: str
+) -> None:
+    monkeypatch.setitem(SCENES, "wrong", lambda: discs)
+    with pytest.raises(ValueError, match=message):
+        Scenario(scene="wrong")
 
 
 @pytest.mark.parametrize("scenario", SHAPES.values(), ids=SHAPES)
