@@ -27,7 +27,7 @@ from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
-from marl_encircle.study.paper import paper_results
+from marl_encircle.study.paper import reported_cells
 from marl_encircle.study.typeset import markdown
 
 MAX_SCENARIOS = 16
@@ -208,10 +208,9 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
 @cache
 def paper_cells() -> dict[Cell, Result]:
     """Return the cells for which the paper has numbers."""
-    cells = {cell: result for table in paper_results().values() for cell, result in table.items()}
     return {
         cell: Result(result.success_percent, result.mean_episode_length)
-        for cell, result in cells.items()
+        for cell, result in reported_cells().items()
         if result.success_percent is not None and result.mean_episode_length is not None
     }
 

@@ -73,7 +73,7 @@ def _is_higher(first: Result, second: Result) -> bool:
     """Whether the paired difference in S, each under its rule, has an interval above zero."""
     if first.runs is None or second.runs is None or first.closure is None or second.closure is None:
         return False
-    if _nothing_to_compare(first.runs, second.runs) is not None:
+    if nothing_to_compare(first.runs, second.runs) is not None:
         return False
     difference = metrics.success_difference(first.runs.finished, second.runs.finished, first.closure, second.closure)
     return difference is not None and difference.verdict == "higher"
@@ -85,7 +85,7 @@ def _all_rows(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns]) -> list[_Row
 
 def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
     ours, other = runs.get(Cell("ours", cell.setting)), runs.get(cell)
-    nothing = _nothing_to_compare(ours, other)
+    nothing = nothing_to_compare(ours, other)
     if nothing is not None or ours is None or other is None or ours.closure is None or other.closure is None:
         yield _Row(cell, None, None, None, None, nothing)
         return
@@ -98,18 +98,18 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
         yield _Row(cell, *closures, success, length, None)
 
 
-def _nothing_to_compare(ours: CellRuns | None, other: CellRuns | None) -> str | None:
+def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:
     """Why two cells cannot be compared; None if they can."""
-    if ours is None or other is None:
+    if first is None or second is None:
         return "not run"
-    if not ours.finished or not other.finished:
+    if not first.finished or not second.finished:
         return "no finished run"
-    if other.runs_of == "ours":
+    if first.finished is second.finished:
         return "the same runs"
-    common = ours.finished.keys() & other.finished.keys()
+    common = first.finished.keys() & second.finished.keys()
     if not common:
         return "no common training seed"
-    if not all(metrics.same_rounds(ours.finished[seed], other.finished[seed]) for seed in common):
+    if not all(metrics.same_rounds(first.finished[seed], second.finished[seed]) for seed in common):
         return "not evaluated on the same rounds"
     return None
 

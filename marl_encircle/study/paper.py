@@ -31,6 +31,11 @@ def paper_results() -> dict[str, dict[Cell, PaperResult]]:
     return tables
 
 
+def reported_cells() -> dict[Cell, PaperResult]:
+    """Return all cells of Tables 2-4, each once; what several tables have is the same in all."""
+    return {cell: result for table in paper_results().values() for cell, result in table.items()}
+
+
 def label(method: str) -> str:
     """Name of a method as the paper writes it; others keep their own."""
     return LABELS.get(method, method)

@@ -13,7 +13,11 @@ from marl_encircle.experiments.grid import Grid, load_grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
-from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, render_table1, render_tables
+from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
+from marl_encircle.study.calibrate import load_protocol
+from marl_encircle.study.cells import gather
+from marl_encircle.study.paper import reported_cells
+from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, frozen_note, render_table1, render_tables
 
 TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
 
@@ -59,14 +63,14 @@ def reproduce(
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:
-    """Render the tables from the runs of a grid; a former table of other settings goes when there is none now.
+    """Render the tables from the runs of a grid; a former table that it does not have goes.
 
     :return: the files written
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
     texts = render(grid, results)
-    for name in OTHER_TABLES:
+    for name in (*OTHER_TABLES, *AGREEMENT_TABLES):
         if f"tables/{name}" not in texts:
             (Path(results) / "tables" / name).unlink(missing_ok=True)
     for name, text in texts.items():
@@ -83,6 +87,9 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
     runs = runs_of(grid, Path(results) / "runs")
     texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
+    if grid.frozen:
+        calibrated = load_protocol("calibration").cells
+        texts |= render_agreement(gather(runs, grid.aliases), reported_cells(), calibrated, frozen_note(grid.frozen))
     return {f"tables/{name}": text for name, text in texts.items()}
 
 

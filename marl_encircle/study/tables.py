@@ -10,7 +10,7 @@ from typing import NamedTuple
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of
 from marl_encircle.study.differences import difference_table, render_differences
-from marl_encircle.study.paper import PaperResult, label, paper_results, rank
+from marl_encircle.study.paper import PaperResult, label, paper_results, rank, reported_cells
 from marl_encircle.study.paper_layout import LAYOUTS, notes_on, seeds_of, success_and_length, wide
 from marl_encircle.study.typeset import (
     DASH,
@@ -79,19 +79,19 @@ def render_tables(
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))
-    frozen_note = _frozen_note(frozen)
+    note = frozen_note(frozen)
     rendered: dict[str, str] = {}
     for name, paper in reported.items():
         results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
-        rendered |= _texts(_main_table(name, results, paper, frozen_note))
+        rendered |= _texts(_main_table(name, results, paper, note))
         rendered[f"{name}.csv"] = to_csv([_record(result, paper.get(result.cell)) for result in results])
-    rendered |= _common_table(cells, by_cell, reported, frozen_note)
+    rendered |= _common_table(cells, by_cell, reported, note)
     if others:
         results = [result_of(cell, by_cell[cell]) for cell in others]
-        other = _other_table(results, frozen_note)
+        other = _other_table(results, note)
         rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
         rendered["table_other.csv"] = to_csv([_record(result, None) for result in results])
-    return rendered | render_differences(cells, by_cell, frozen_note)
+    return rendered | render_differences(cells, by_cell, note)
 
 
 def render_table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> dict[str, str]:
@@ -112,7 +112,7 @@ def table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> T
     """Table 1 as a table; see :func:`render_table1`."""
     rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
     header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
-    return Table("table1", _TABLE1, header, rows, _frozen_note(frozen))
+    return Table("table1", _TABLE1, header, rows, frozen_note(frozen))
 
 
 def main_tables(
@@ -126,7 +126,7 @@ def main_tables(
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))
-    note = _frozen_note(frozen)
+    note = frozen_note(frozen)
     tables = [
         _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, note)
         for name, paper in reported.items()
@@ -145,7 +145,8 @@ def _texts(table: Table) -> dict[str, str]:
     }
 
 
-def _frozen_note(frozen: str | None) -> list[str]:
+def frozen_note(frozen: str | None) -> list[str]:
+    """Return the note on the commit in which scenario and recipe were frozen, if there is one."""
     return [] if frozen is None else [f"Scenario and recipe frozen in commit {frozen[:12]}."]
 
 
@@ -161,13 +162,11 @@ def _by_method(cells: Iterable[Cell]) -> list[Cell]:
     return sorted(cells, key=lambda cell: (rank(cell.method), cell))
 
 
-def _main_table(
-    name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], frozen_note: Sequence[str]
-) -> Table:
+def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], note: Sequence[str]) -> Table:
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
     header, rows, seeds = wide(layout, results, paper)
-    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper), *seeds, *frozen_note]
+    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper), *seeds, *note]
     return Table(name, layout.title, header, rows, notes)
 
 
@@ -175,25 +174,25 @@ def _common_table(
     cells: Sequence[Cell],
     runs: Mapping[Cell, CellRuns],
     reported: Mapping[str, Mapping[Cell, PaperResult]],
-    frozen_note: Sequence[str],
+    note: Sequence[str],
 ) -> dict[str, str]:
     """All cells of Tables 2-4 under the common closure rule."""
     results = [result_of(cell, runs.get(cell), "all") for cell in cells]
-    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, {}), *frozen_note]
+    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, {}), *note]
     sections = [f"# {_COMMON}\n\n" + "".join(f"- {note}\n" for note in notes)]
     for name, paper in reported.items():
         settings = {cell.setting for cell in paper}
         layout = LAYOUTS[name]
         header, rows, seeds = wide(layout, [result for result in results if result.cell.setting in settings], {})
         sections.append(markdown(layout.title, header, rows, seeds, level=2))
-    every = {cell: result for paper in reported.values() for cell, result in paper.items()}
+    every = reported_cells()
     return {
         "table_common_rule.md": "\n".join(sections),
         "table_common_rule.csv": to_csv([_record(result, every.get(result.cell)) for result in results]),
     }
 
 
-def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> Table:
+def _other_table(results: Sequence[Result], note: Sequence[str]) -> Table:
     """Cells of other settings, a line for each."""
     rows = [
         [
@@ -205,7 +204,7 @@ def _other_table(results: Sequence[Result], frozen_note: Sequence[str]) -> Table
         ]
         for result in results
     ]
-    notes = [_OWN_RULE_NOTE, *notes_on(results, {}), *frozen_note]
+    notes = [_OWN_RULE_NOTE, *notes_on(results, {}), *note]
     return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
 
 
