@@ -3,7 +3,6 @@
 A term gets its weight, its parameters and its name in the logs from the reward's YAML line of the same name.
 """
 
-import difflib
 import inspect
 import sys
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from marl_encircle.core.geometry import Closure, Enclosure, Measure
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import State
+from marl_encircle.spelling import nearest
 
 Array = NDArray[np.float64]
 
@@ -221,9 +221,3 @@ class Reward:
             share = (self.scale * weight) * value
             shares[name] = share * gate if gate is not None and name in CONTRACTION_STAGE else share
         return shares
-
-
-def nearest(name: str, known: Any) -> str:
-    """Return '; did you mean ...?' for a misspelt name, or what is known."""
-    close = difflib.get_close_matches(name, sorted(known), n=1)
-    return f"; did you mean {close[0]}?" if close else f"; known: {', '.join(sorted(known))}"

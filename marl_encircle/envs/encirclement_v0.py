@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec, parallel_to_aec_wrapper
 
-from marl_encircle.core.rewards import Reward, nearest
+from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.spelling import nearest
 
 Array = NDArray[np.float32]
 Weights = Mapping[str, float | Mapping[str, float] | None]

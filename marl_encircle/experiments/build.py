@@ -11,7 +11,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from marl_encircle import files
 from marl_encircle.core.observations import bounds
-from marl_encircle.core.rewards import nearest
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
@@ -30,6 +29,7 @@ from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
+from marl_encircle.spelling import nearest
 
 Engine = Literal["native", "supersuit"]
 

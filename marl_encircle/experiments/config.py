@@ -27,12 +27,13 @@ from pydantic import (
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import layout
-from marl_encircle.core.rewards import Reward, nearest
+from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, parse_yaml
 from marl_encircle.maddpg import ALGORITHMS
+from marl_encircle.spelling import nearest
 
 Profile = Literal["full", "smoke"]
 Count = Annotated[int, Field(ge=1, le=10**10)]

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from marl_encircle.core.rewards import nearest
 from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, read_yaml
+from marl_encircle.spelling import nearest
 
 PACKAGE = Path(__file__).parent.parent
 

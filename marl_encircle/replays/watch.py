@@ -10,7 +10,6 @@ import numpy as np
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import bounds
-from marl_encircle.core.rewards import nearest
 from marl_encircle.core.scenes import SCENES
 from marl_encircle.envs.view import View
 from marl_encircle.experiments.build import load_run
@@ -21,6 +20,7 @@ from marl_encircle.experiments.records import Cell, Setting, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.replay import Replay, record_round
+from marl_encircle.spelling import nearest
 
 WATCHED_SEED = 7000
 """Evaluation seed of the rounds that are shown unless another is asked for: neither trained on nor reported."""
