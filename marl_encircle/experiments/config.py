@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 from pydantic import (
     AfterValidator,
@@ -413,7 +413,7 @@ def _with_file(line: str, names: Mapping[str, str], changes: Mapping[str, Any]) 
         changed = changes.get(section, {})
         if changed and holds(changed, keys[:length]):
             return line
-        path = library.file_of(section, names[section], keys[:length])
+        path = library.file_of(cast(library.Kind, section), names[section], keys[:length])
         if path is not None:
             return f"{path}: {line}"
     return line

@@ -17,7 +17,7 @@ from marl_encircle.experiments.config import (
     explain,
     load_config,
 )
-from marl_encircle.experiments.library import find_plan, is_path
+from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
@@ -113,7 +113,7 @@ def load_grid(name: str) -> Grid:
     :raises ConfigError: naming file and key; all configurations are checked too
     """
     _config.cache_clear()
-    path = find_plan(name, "grid")
+    path = find_file(name, "grid")
     try:
         grid = GridConfig(**read_yaml(path))
     except ValidationError as error:

@@ -5,7 +5,7 @@
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,15 +14,30 @@ from marl_encircle.spelling import nearest
 
 PACKAGE = Path(__file__).parent.parent
 
+Kind = Literal["reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol"]
+"""What a YAML file of ours may be: a section of a configuration, or a plan of many runs."""
+
 PROTOCOLS = ("calibration",)
 """Files of ``configs/paper/`` that are protocols; the others are grids."""
 
 MAX_BASES = 20
 
 
+def files_of(kind: Kind) -> dict[str, Path]:
+    """Return the files of a kind that the installation carries, by name."""
+    if kind == "reward":
+        folders = _reward_folders()
+    else:
+        folders = [PACKAGE / "configs" / ("paper" if kind in ("grid", "protocol") else kind)]
+    found = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
+    if kind in ("grid", "protocol"):
+        found = {name: path for name, path in found.items() if (name in PROTOCOLS) == (kind == "protocol")}
+    return dict(sorted(found.items()))
+
+
 def reward_names() -> list[str]:
     """Return the names of the methods that the installation carries."""
-    return sorted(path.stem for folder in _reward_folders() for path in folder.glob("*.yaml"))
+    return list(files_of("reward"))
 
 
 def load_reward(name: str) -> dict[str, Any]:
@@ -34,50 +49,37 @@ def load_reward(name: str) -> dict[str, Any]:
     return {"name": Path(name).stem, **load_section("reward", name)}
 
 
-def load_section(section: str, name: str) -> dict[str, Any]:
-    """Return the values of a section's file.
+def load_section(section: Kind, name: str) -> dict[str, Any]:
+    """Return the values of a section's file on top of its base's.
 
-    :param section: a folder of ``configs/``
-    :param name: a name in that folder, or the path of a YAML file
+    :param name: a name of that kind, or the path of a YAML file
     :raises ConfigError: naming the file, and the nearest name
     """
-    folders = _folders(section)
-    return _load(find_file(name, folders, section), folders, section)
+    values: dict[str, Any] = {}
+    for _, below in reversed(_chain(name, section)):
+        if section == "reward":  # a changed method is another one: without a name of its own, its file's
+            values.pop("name", None)
+        values = merge(values, below)
+    return values
 
 
-def file_of(section: str, name: str, keys: Sequence[str]) -> Path | None:
+def file_of(section: Kind, name: str, keys: Sequence[str]) -> Path | None:
     """Return the file in which a key stands: the last one of a chain of bases that has it, or None.
 
-    :param section: ``reward`` or a folder of ``configs/``
     :param name: what :func:`load_reward` or :func:`load_section` was called with
     :param keys: path of the key below the section
     """
-    folders = _folders(section)
-    chain = _chain(find_file(name, folders, section), folders, section)
-    return next((path for path, values in chain if holds(values, keys)), None)
+    return next((path for path, values in _chain(name, section) if holds(values, keys)), None)
 
 
-def find_file(name: str, folders: Iterable[Path], kind: str) -> Path:
-    """Return the file of that name in one of the folders, or of that path.
-
-    :raises ConfigError: naming the nearest name
-    """
-    return _choose(name, (path for folder in folders for path in folder.glob("*.yaml")), kind)
-
-
-def find_plan(name: str, kind: Literal["grid", "protocol"]) -> Path:
-    """Return the file of that name in ``configs/paper/``, where grids and protocols lie, or of that path.
+def find_file(name: str, kind: Kind) -> Path:
+    """Return the file of that kind and name, or of that path.
 
     :raises ConfigError: naming the nearest name of that kind
     """
-    paths = (PACKAGE / "configs" / "paper").glob("*.yaml")
-    return _choose(name, (path for path in paths if (path.stem in PROTOCOLS) == (kind == "protocol")), kind)
-
-
-def _choose(name: str, paths: Iterable[Path], kind: str) -> Path:
     if is_path(name):
         return Path(name)
-    known = {path.stem: path for path in paths}
+    known = files_of(kind)
     if name not in known:
         raise ConfigError(f"{kind} {name!r:.80}: neither a known name nor a .yaml path{nearest(name, known)}")
     return known[name]
@@ -88,28 +90,15 @@ def is_path(name: str) -> bool:
     return name.lower().endswith((".yaml", ".yml")) or os.sep in name
 
 
-def _folders(section: str) -> list[Path]:
-    return _reward_folders() if section == "reward" else [PACKAGE / "configs" / section]
-
-
 def _reward_folders() -> list[Path]:
     """``ablations`` and ``baselines``: in the package of a built install, beside it in a checkout."""
     roots = (PACKAGE, PACKAGE.parent)
     return [root / name for name in ("ablations", "baselines") for root in roots if (root / name).is_dir()]
 
 
-def _load(path: Path, folders: Iterable[Path], kind: str) -> dict[str, Any]:
-    """Read a file on top of its base's."""
-    values: dict[str, Any] = {}
-    for _, below in reversed(_chain(path, folders, kind)):
-        if kind == "reward":  # a changed method is another one: without a name of its own, its file's
-            values.pop("name", None)
-        values = merge(values, below)
-    return values
-
-
-def _chain(path: Path, folders: Iterable[Path], kind: str) -> list[tuple[Path, dict[str, Any]]]:
+def _chain(name: str, kind: Kind) -> list[tuple[Path, dict[str, Any]]]:
     """Return a file, its base, that one's base and so on, each with the values that stand in it."""
+    path = find_file(name, kind)
     chain: list[tuple[Path, dict[str, Any]]] = []
     seen: list[str] = []
     while True:
@@ -127,6 +116,6 @@ def _chain(path: Path, folders: Iterable[Path], kind: str) -> list[tuple[Path, d
         if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
             raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
         try:
-            path = path.parent / base if is_path(base) else find_file(base, folders, kind)
+            path = path.parent / base if is_path(base) else find_file(base, kind)
         except ConfigError as error:
             raise ConfigError(f"{path}: base: {error}") from error

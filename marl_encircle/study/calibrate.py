@@ -22,7 +22,7 @@ from pydantic import Field, ValidationError
 from marl_encircle import files
 from marl_encircle.experiments.config import Profile, Section, check_seed, explain
 from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
-from marl_encircle.experiments.library import find_plan
+from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
@@ -90,7 +90,7 @@ def load_protocol(name: str) -> Protocol:
     :param name: a name in ``configs/paper/`` or the path of a YAML file
     :raises ConfigError: naming file and key
     """
-    path = find_plan(name, "protocol")
+    path = find_file(name, "protocol")
     try:
         protocol = Protocol(**read_yaml(path))
     except ValidationError as error:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from marl_encircle.experiments.library import PACKAGE, find_file, find_plan, load_reward, load_section, reward_names
+from marl_encircle.experiments.library import PACKAGE, find_file, load_reward, load_section, reward_names
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 
@@ -27,21 +27,20 @@ def test_the_installation_knows_the_papers_methods_and_the_algorithms() -> None:
     assert load_section("algorithm", "matd3")["name"] == "matd3"
 
 
-def test_a_name_is_looked_up_in_every_folder_and_a_path_in_none(tmp_path: Path) -> None:
-    first, second = (write(tmp_path, name, "") for name in ("a/first.yaml", "b/second.yaml"))
-    folders = [tmp_path / "a", tmp_path / "b"]
-    assert [find_file(name, folders, "grid") for name in ("first", "second")] == [Path(first), Path(second)]
-    assert find_file("first.yaml", folders, "grid") == Path("first.yaml")
-    with pytest.raises(ConfigError, match=r"grid 'second2': neither a known name .*did you mean second"):
-        find_file("second2", folders, "grid")
+def test_a_name_is_looked_up_in_every_folder_and_a_path_in_none() -> None:
+    paths = [find_file(name, "reward") for name in ("model_a", "ma2019")]
+    assert [path.parent.name for path in paths] == ["ablations", "baselines"]
+    assert find_file("model_a.yaml", "reward") == Path("model_a.yaml")
+    with pytest.raises(ConfigError, match=r"grid 'smok': neither a known name .*did you mean smoke"):
+        find_file("smok", "grid")
 
 
 def test_every_plan_of_the_package_is_of_its_kind() -> None:
     for path in (PACKAGE / "configs" / "paper").glob("*.yaml"):
         kind: Any = "protocol" if "neighbours" in read_yaml(path) else "grid"
-        assert find_plan(path.stem, kind) == path
+        assert find_file(path.stem, kind) == path
         with pytest.raises(ConfigError, match="neither a known name"):
-            find_plan(path.stem, "grid" if kind == "protocol" else "protocol")
+            find_file(path.stem, "grid" if kind == "protocol" else "protocol")
 
 
 def test_a_chain_of_bases_is_followed_from_file_to_file(tmp_path: Path) -> None:
