@@ -39,6 +39,7 @@ __all__ = [
     "check_display",
     "draw",
     "draw_low",
+    "draw_scene",
     "open_window",
     "picture",
     "view",
@@ -80,7 +81,7 @@ def array_of(surface: Any) -> NDArray[np.uint8]:
 def draw(view: View, layers: Layers = EVERYTHING) -> Any:
     """Return a drawing of the world as a pygame surface, the panel at its right; needs no display."""
     large = _sheet(SCENE + PANEL, SCENE)
-    _draw_scene(_part(large, 0, 0, SCENE, SCENE), view, layers)
+    draw_scene(_part(large, 0, 0, SCENE, SCENE), view, layers)
     Panel(_part(large, SCENE, 0, PANEL, SCENE), view).draw_column()
     return pygame.transform.smoothscale(large, (SCENE + PANEL, SCENE))
 
@@ -90,12 +91,13 @@ def draw_low(view: View, layers: Layers = EVERYTHING) -> Any:
     height = LOW_TITLE + LOW_SCENE + LOW_PANEL
     large = _sheet(LOW_SCENE, height)
     Panel(_part(large, 0, 0, LOW_SCENE, LOW_TITLE), view).draw_head()
-    _draw_scene(_part(large, 0, LOW_TITLE, LOW_SCENE, LOW_SCENE), view, layers)
+    draw_scene(_part(large, 0, LOW_TITLE, LOW_SCENE, LOW_SCENE), view, layers)
     Panel(_part(large, 0, LOW_TITLE + LOW_SCENE, LOW_SCENE, LOW_PANEL), view).draw_row()
     return pygame.transform.smoothscale(large, (LOW_SCENE, height))
 
 
-def _draw_scene(surface: Any, view: View, layers: Layers) -> None:
+def draw_scene(surface: Any, view: View, layers: Layers = EVERYTHING) -> None:
+    """Draw the scene alone on a square surface, ``SUPERSAMPLING`` times as large as it will be seen."""
     scene = _Scene(surface, view, layers)
     scene.draw()
     scene.draw_lens()

@@ -22,6 +22,7 @@ from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.metrics import summarise_run
 from marl_encircle.maddpg import MADDPG
+from marl_encircle.maddpg.policies import MADDPGPolicy
 
 
 class Stopped(Exception):  # noqa: N818 - nothing is wrong
@@ -114,16 +115,23 @@ class LearningCurve(BaseCallback):
     :param config: of the run
     :param path: of the file
     :param rows: of an earlier part of the training
+    :param add_pictures: called at every point with the policy, the point's number and the agents' steps
     """
 
     COLUMNS = ("world_steps", "success", "mean_episode_length", "success_all", "success_pursuers", "sigma_c")
     model: MADDPG
 
     def __init__(
-        self, config: Config, curriculum: CurriculumVecEnv, path: Path, rows: list[list[float | None]]
+        self,
+        config: Config,
+        curriculum: CurriculumVecEnv,
+        path: Path,
+        rows: list[list[float | None]],
+        add_pictures: Callable[[MADDPGPolicy, int, int], None] | None = None,
     ) -> None:
         super().__init__()
         self.config, self.curriculum, self.path, self.rows = config, curriculum, path, rows
+        self.add_pictures = add_pictures
 
     def _on_rollout_start(self) -> None:
         due = (len(self.rows) + 1) * self.config.training.curve_every
@@ -144,7 +152,10 @@ class LearningCurve(BaseCallback):
         for name, value in zip(self.COLUMNS[1:], row[1:], strict=True):
             if value is not None:
                 self.logger.record(f"eval/{name}", value)
+        self.model.dump_logs()  # at the steps of the point, and before a checkpoint that knows it
         self.write()
+        if self.add_pictures:
+            self.add_pictures(self.model.policy, len(self.rows), self.model.num_timesteps)
 
     def write(self) -> None:
         """Write the curve so far, even if it has no points yet."""

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch as th
-from stable_baselines3.common import logger
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger
 
 from marl_encircle import files, locks
 from marl_encircle.core.simulator import Difficulty, Simulator
@@ -40,6 +39,7 @@ from marl_encircle.experiments.config import Config, check_seed, check_training,
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import Episode, config_hash, episodes_to_csv, read_record, run_path
+from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1
@@ -64,6 +64,7 @@ def train(
     checkpoint_every: float = 120.0,
     progress_bar: bool = False,
     tensorboard: bool = False,
+    draw: Draw | None = None,
 ) -> tuple[Path, bool]:
     """Train, evaluate and record one run; go on where an interrupted one stopped.
 
@@ -72,6 +73,7 @@ def train(
     :param out: folder of runs
     :param checkpoint_every: seconds between checkpoints
     :param tensorboard: write event files into the run folder
+    :param draw: how rounds are drawn into them, for example by :mod:`marl_encircle.replays.thumbnails`
     :return: the run folder, and whether anything was left to do
     :raises ConfigError: for a seed or a configuration that cannot be trained, before anything is written
     :raises OtherRunError: if the folder holds a run of another configuration or engine, with the difference
@@ -86,18 +88,15 @@ def train(
         return folder, False
     plan = _plan(config, seed, engine)
     check_training(config)
-    if tensorboard and getattr(logger, "SummaryWriter", None) is None:  # as SB3 says that it cannot import it
-        raise ConfigError(
-            "event files need TensorBoard, which cannot be imported: pip install 'tensorboard>=2.18', or train without "
-            "them (--no-tensorboard)"
-        )
+    if tensorboard:
+        check_tensorboard()
     _check_placement(config)
     with locks.folder_lock(folder):
         if (folder / "run.json").exists():  # by whoever had the lock until now
             check_same_run(folder, config, seed, engine)
             return folder, False
         th.set_num_threads(1)
-        _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard)
+        _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard, draw)
     return folder, True
 
 
@@ -124,12 +123,16 @@ class _Run:
                 raise files.DamagedFileError(path, f"does not fit this training: {str(error)[:200]}") from error
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def play(self, checkpoint_every: float, progress_bar: bool, tensorboard: bool) -> None:
+    def play(self, checkpoint_every: float, progress_bar: bool, tensorboard: bool, draw: Draw | None) -> None:
         """Train to the end, then evaluate and record."""
         model, curriculum, total = self.model, self.curriculum, self.config.training.world_steps
-        folder = self.folder / "tensorboard"
-        model.set_logger(configure(str(folder), ["tensorboard"]) if tensorboard else Logger(None, []))
-        curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows)
+        events = None
+        if tensorboard:
+            folder, steps = self.folder / "tensorboard", model.num_timesteps
+            events = EventFiles(folder, self.config, self.plan["seed"], steps, draw)
+        model.set_logger(Logger(None, [events] if events else []))
+        add_pictures = events.add_pictures if events else None
+        curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows, add_pictures)
         guard = DivergenceGuard()
         callbacks: list[BaseCallback] = [RoundLogger(curriculum), guard, curve]
         bar = ProgressBar(curriculum, total)
@@ -150,8 +153,6 @@ class _Run:
                 curve.add_point()
             except Diverged:
                 status = "diverged"
-            else:
-                model.dump_logs()
             finally:
                 bar.close()
                 model.logger.close()

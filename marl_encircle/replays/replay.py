@@ -1,6 +1,6 @@
 """One evaluation round, played again and recorded step by step: what drawings and players of rounds show."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -133,41 +133,72 @@ def record_round(
     :param eval_seed: evaluation seed, usually ``config.evaluation.seed``
     :param scene: play in a scene of this name instead of the configuration's; same seed, other obstacles
     """
-    scenario = replace(
-        config.scenario, n_directions=config.evaluation.n_directions, scene=scene or config.scenario.scene
-    )
     # The round is played among the same others as in its evaluation, since rounding depends on the batch.
     first, world = round_number - round_number % WORLDS_AT_ONCE, round_number % WORLDS_AT_ONCE
     seeds = world_seeds(eval_seed, first + WORLDS_AT_ONCE)[first:]
+    (replay,) = _record(policy, config, seeds, [world], first, scene)
+    return replay
+
+
+def record_first_rounds(policy: MADDPGPolicy, config: Config, n: int, eval_seed: int) -> list[Replay]:
+    """Record rounds 0 to n - 1 of an evaluation in one go; see :func:`record_round`.
+
+    :param n: 1 to ``WORLDS_AT_ONCE``
+    """
+    return _record(policy, config, world_seeds(eval_seed, WORLDS_AT_ONCE), list(range(n)), 0, None)
+
+
+def _record(
+    policy: MADDPGPolicy, config: Config, seeds: Sequence[int], worlds: list[int], first_round: int, scene: str | None
+) -> list[Replay]:
+    """Play the rounds of a batch of worlds and record some of them, each to its own end."""
+    scenario = replace(
+        config.scenario, n_directions=config.evaluation.n_directions, scene=scene or config.scenario.scene
+    )
     reward = config.reward.build()
     arena = Arena(scenario, reward, len(seeds))
     sim = arena.simulator
     sim.seed(seeds)
     observations = arena.reset()
-    moments, rewards = [_Moment.of(sim, world)], []
+    moments = {world: [_Moment.of(sim, world)] for world in worlds}
+    rewards: dict[int, list[Array]] = {world: [] for world in worlds}
+    playing = worlds
     for _ in range(scenario.max_cycles):
         slots, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
         outcome = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE))
         observations = outcome.observations
-        rewards.append(outcome.rewards[world].astype(np.float64))
-        moments.append(_Moment.of(sim, world))
-        steps = {rule: int(step[world]) for rule, step in arena.rounds.success_step.items()}
-        if NEVER not in steps.values():
+        for world in playing:
+            rewards[world].append(outcome.rewards[world].astype(np.float64))
+            moments[world].append(_Moment.of(sim, world))
+        playing = [world for world in playing if None in _success_steps(arena, world).values()]
+        if not playing:
             break
-    return Replay(
-        scenario=scenario,
-        closure=reward.closure,
-        round=round_number,
-        seed=seeds[world],
-        step_all=None if steps["all"] == NEVER else steps["all"],
-        step_pursuers=None if steps["pursuers"] == NEVER else steps["pursuers"],
-        pursuers=_stack(moments, lambda moment: moment.pursuers),
-        velocities=_stack(moments, lambda moment: moment.velocities),
-        target=_stack(moments, lambda moment: moment.target),
-        discs=_frozen(sim.state.discs[world].copy()),
-        enclosure={"all": _over_time(moments, "all"), "pursuers": _over_time(moments, "pursuers")},
-        rewards=_frozen(np.stack(rewards)),
-    )
+    return [
+        Replay(
+            scenario=scenario,
+            closure=reward.closure,
+            round=first_round + world,
+            seed=seeds[world],
+            step_all=_success_steps(arena, world)["all"],
+            step_pursuers=_success_steps(arena, world)["pursuers"],
+            pursuers=_stack(moments[world], lambda moment: moment.pursuers),
+            velocities=_stack(moments[world], lambda moment: moment.velocities),
+            target=_stack(moments[world], lambda moment: moment.target),
+            discs=_frozen(sim.state.discs[world].copy()),
+            enclosure={
+                "all": _over_time(moments[world], "all"),
+                "pursuers": _over_time(moments[world], "pursuers"),
+            },
+            rewards=_frozen(np.stack(rewards[world])),
+        )
+        for world in worlds
+    ]
+
+
+def _success_steps(arena: Arena, world: int) -> dict[Closure, int | None]:
+    """Return the step at which each rule first held in a world; None if it has not."""
+    steps = {rule: int(step[world]) for rule, step in arena.rounds.success_step.items()}
+    return {rule: None if step == NEVER else step for rule, step in steps.items()}
 
 
 class _Moment(NamedTuple):

@@ -1,0 +1,204 @@
+"""What TensorBoard shows of a training: curves and their layout, the configuration as tables, rounds as pictures.
+
+The steps are SB3's, those of all agents: world steps times pursuers. All that is under ``eval/`` comes from the
+selection rounds, which are never reported.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stable_baselines3.common import logger
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+from marl_encircle.core.rewards import TERMS
+from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.maddpg.policies import MADDPGPolicy
+
+MOMENTS = 5
+"""At how many points of a learning curve rounds are drawn, at most."""
+
+WORLD_STEPS_BETWEEN = 200_000
+"""From one such point to the next, at least."""
+
+METRICS = ("eval/success", "eval/mean_episode_length", "eval/sigma_c")
+"""What hyper-parameters are judged by; not the reported rounds, since choosing by them would spoil the report."""
+
+LAYOUT = {
+    "Selection rounds": {
+        "success, the method's own rule": ["Multiline", ["eval/success$"]],
+        "mean episode length (MEL) of the successful rounds": ["Multiline", ["eval/mean_episode_length"]],
+        "success under both rules": ["Multiline", ["eval/success_all", "eval/success_pursuers"]],
+    },
+    "Losses": {
+        "critic": ["Multiline", ["train/critic_loss"]],
+        "actor": ["Multiline", ["train/actor_loss"]],
+    },
+    "Curriculum": {
+        "difficulty": ["Multiline", ["curriculum/.+"]],
+        "success in training": ["Multiline", ["rounds/success_.+"]],
+    },
+    "Reward": {
+        "terms, per round": ["Multiline", ["reward/.+"]],
+        "return": ["Multiline", ["rollout/ep_rew_mean"]],
+    },
+}
+"""Charts of the custom scalars by category; tags are regular expressions."""
+
+
+class Picture(NamedTuple):
+    """A drawing for the image dashboard.
+
+    :param tag: its name there
+    :param data: a PNG or GIF file
+    :param width: [pixels]
+    :param height: [pixels]
+    """
+
+    tag: str
+    data: bytes
+    width: int
+    height: int
+
+
+Draw = Callable[[MADDPGPolicy, Config], Sequence[Picture]]
+"""Draws rounds of a policy."""
+
+
+def check_tensorboard() -> None:
+    """Raise a ConfigError unless event files can be written."""
+    if getattr(logger, "SummaryWriter", None) is None:  # as SB3 says that it cannot import it
+        raise ConfigError(
+            "event files need TensorBoard, which cannot be imported: pip install 'tensorboard>=2.18', or train without "
+            "them (--no-tensorboard)"
+        )
+
+
+class EventFiles(TensorBoardOutputFormat):
+    """SB3's event files, which say what is trained and go on after a resume.
+
+    What an earlier process logged after the checkpoint that the training goes on from is hidden. Means over the rounds
+    since the last log start anew there.
+
+    :param folder: of the event files
+    :param seed: training seed
+    :param steps: of all agents until now
+    :param draw: how to draw rounds; None for no pictures
+    """
+
+    def __init__(self, folder: Path, config: Config, seed: int, steps: int, draw: Draw | None = None) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+        resumed = any(folder.glob("events.out.tfevents.*"))
+        super().__init__(str(folder))
+        self.config, self.draw = config, draw
+        if resumed:
+            first = steps + 1 if steps else 0  # a training that starts over describes itself anew
+            writer: Any = self.writer.file_writer
+            writer.add_event(Event(file_version="brain.Event:2"), first)
+            writer.add_event(Event(session_log=SessionLog(status=SessionLog.START)), first)
+        if not (resumed and steps):
+            describe(self.writer, config, seed)
+
+    def add_pictures(self, policy: MADDPGPolicy, point: int, steps: int) -> None:
+        """Draw the rounds of a policy if it is time to.
+
+        :param point: number of the point of the learning curve, from 1
+        :param steps: of all agents until now
+        """
+        if self.draw is None or not is_drawn(self.config, point):
+            return
+        for picture in self.draw(policy, self.config):
+            add_picture(self.writer, picture, steps)
+        self.writer.flush()
+
+
+def is_drawn(config: Config, point: int) -> bool:
+    """Whether rounds are drawn at a point of the learning curve: at the last one and at the same distance before it.
+
+    :param point: its number, from 1
+    """
+    training = config.training
+    points = -(-training.world_steps // training.curve_every)
+    moments = min(max(training.world_steps // WORLD_STEPS_BETWEEN, 1), MOMENTS, points)
+    return point * moments // points > (point - 1) * moments // points
+
+
+def describe(writer: Any, config: Config, seed: int) -> None:
+    """Write what is trained: the charts' layout, the configuration as tables, the hyper-parameters.
+
+    :param writer: PyTorch's ``SummaryWriter``
+    """
+    from torch.utils.tensorboard.summary import hparams
+
+    writer.add_custom_scalars(LAYOUT)
+    for tag, text in texts(config, seed).items():
+        writer.add_text(tag, text, 0)
+    values = hyperparameters(config, seed)
+    for summary in hparams(values, dict.fromkeys(METRICS, 0.0)):  # type: ignore[no-untyped-call]
+        writer.file_writer.add_summary(summary)
+    writer.flush()
+
+
+def add_picture(writer: Any, picture: Picture, steps: int) -> None:
+    """Write a picture as it is: PyTorch's ``add_video`` needs moviepy, and not even its present version."""
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    image = Summary.Image(height=picture.height, width=picture.width, colorspace=3, encoded_image_string=picture.data)
+    writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=picture.tag, image=image)]), steps)
+
+
+def texts(config: Config, seed: int) -> dict[str, str]:
+    """Return Markdown by tag: the reward, and the other sections of the resolved configuration."""
+    values, reward = config.to_dict(), config.reward
+    head = f"**{reward.name}**: closure {reward.closure}, {'two stages' if reward.two_stage else 'one stage'}"
+    active = reward.build().active.items()
+    terms = [(name, f"{weight:g}", _in_words(parameters)) for name, (weight, parameters) in active]
+    sections = [
+        f"### {section}\n\n"
+        + _table(("key", "value"), [(key, _in_words(value)) for key, value in values[section].items()])
+        for section in ("scenario", "algorithm", "training", "evaluation")
+    ]
+    return {
+        "reward": f"{head}, scale {reward.scale:g}\n\n{_table(('term', 'weight', 'parameters'), terms)}",
+        "configuration": "\n\n".join([f"Training seed {seed}.", *sections]),
+    }
+
+
+def hyperparameters(config: Config, seed: int) -> dict[str, str | float]:
+    """Return the setting, what learns and what it is rewarded for; a reward term that is off has weight 0."""
+    values = config.to_dict()
+    active = config.reward.build().active
+    chosen = {
+        "method": config.reward.name,
+        **config.cell.setting._asdict(),
+        "seed": seed,
+        "training": {key: values["training"][key] for key in ("n_worlds", "world_steps")},
+        "algorithm": values["algorithm"],
+        "reward": {key: values["reward"][key] for key in ("closure", "two_stage", "scale")},
+        "weight": {name: active[name][0] if name in active else 0.0 for name in TERMS},
+    }
+    return dict(_flat(chosen))
+
+
+def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str | float]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value if isinstance(value, (str, float, int)) else _in_words(value)
+
+
+def _in_words(value: Any) -> str:
+    """Return a value in one line."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_in_words(inner)}" for key, inner in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(_in_words, value))
+    return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
