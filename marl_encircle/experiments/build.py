@@ -1,5 +1,6 @@
 """Configuration -> objects: the environment that trains, the model, and a trained policy read back."""
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -22,16 +23,24 @@ from marl_encircle.experiments.config import (
     Config,
     Profile,
     Schedule,
-    check_curriculum,
     load_config,
 )
+from marl_encircle.experiments.pretrained import find_run, is_run_path, pretrained_runs, setting_of
 from marl_encircle.experiments.records import read_record
+from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
+from marl_encircle.maddpg.maddpg import load_actors
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.spelling import nearest
 
 Engine = Literal["native", "supersuit"]
+
+POLICY = "policy.safetensors"
+"""The actors' weights in a run folder."""
+
+MAX_HEADER_BYTES = 1 << 16
+"""Largest header of one: names and shapes of a few arrays per layer. Each name costs memory, whatever it stands for."""
 
 
 def make_vec_env(
@@ -156,17 +165,19 @@ class NoiseSchedule:
 
 
 def build_policy(config: Config) -> MADDPGPolicy:
-    """Return an untrained policy for a configuration's scenario, to load weights into."""
+    """Return an untrained policy for a configuration's scenario, to load actors into; its critics are of no use."""
     low, high = bounds(config.scenario)
     algorithm: AlgorithmConfig = config.algorithm
-    return MADDPGPolicy(
+    policy = MADDPGPolicy(
         spaces.Box(low, high),
         spaces.Box(-1.0, 1.0, (2,)),
         lambda _: algorithm.learning_rate,
         n_agents=config.scenario.pursuers,
-        critic=algorithm.critic,
-        net_arch=list(algorithm.net_arch),
+        critic="shared",
+        net_arch={"pi": list(algorithm.net_arch), "qf": []},
     )
+    policy.agents = config.scenario.agents
+    return policy
 
 
 def policy_bytes(policy: MADDPGPolicy) -> bytes:
@@ -174,38 +185,82 @@ def policy_bytes(policy: MADDPGPolicy) -> bytes:
     return safetensors.torch.save(policy.actor_state_dict())
 
 
-def load_policy(run_folder: str | Path) -> MADDPGPolicy:
-    """Return the trained policy of a run folder, checked against its recorded hash.
+def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MADDPGPolicy:
+    """Return a trained policy: one that comes with the package, by name, or that of a run folder.
 
-    Reads JSON and safetensors only: nothing in a run folder can run code.
+    Reads JSON and safetensors only, which cannot run code, and checks them against the recorded hashes.
 
-    :param run_folder: a folder that ``marl-encircle train`` wrote
-    :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
+    :param what: a method's name, for its first training seed in a setting; a run folder or the ``policy.safetensors``
+        in one; or, if it is ``trusted``, a zip-file that ``MADDPG.save`` wrote, from which only the actors are taken
+    :param trusted: read a zip-file, **which can run code when it is loaded**
+    :param fields: ``speed_ratio``, ``pursuers``, ``obstacles`` and ``scene`` of a name's setting; 1.1, 3, 1 and random
+        where they are not given
+    :raises ConfigError: for a name or a setting without a policy, with those that there are and the nearest
+    :raises DamagedFileError: if a file is missing, changed, does not fit the configuration, or is not trusted
     """
-    policy, _, _ = load_run(run_folder)
+    if isinstance(what, str) and not is_run_path(what):
+        what = find_run(what, setting_of(fields), [pretrained_runs()])
+    elif fields:
+        raise ConfigError(f"{what}: has a setting of its own; {', '.join(fields)} can only be given with a name")
+    path = Path(what)
+    if trusted and zipfile.is_zipfile(path):
+        try:
+            return load_actors(path)
+        except Exception as error:  # unpickling raises whatever it likes
+            raise files.DamagedFileError(path, f"holds no actors: {_one_line(error)}") from error
+    policy, _, _ = load_run(path)
     return policy
 
 
-def load_run(run_folder: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
-    """Return a finished run's policy, configuration and record; see :func:`load_policy`."""
-    folder = Path(run_folder)
+def load_run(run: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
+    """Return a run's policy, configuration and record; see :func:`load_policy`.
+
+    :param run: its folder, or the ``policy.safetensors`` in it
+    :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
+    """
+    folder = Path(run)
+    if folder.name == POLICY:
+        folder = folder.parent
+    if folder.is_file():
+        raise files.DamagedFileError(folder, _no_run(folder))
     record = read_record(folder)
-    path = folder / "policy.safetensors"
     config = config_of(record, folder)
-    data = files.read_bytes(path, sha256=record["sha256"]["policy.safetensors"], max_bytes=MAX_POLICY_BYTES)
+    data = files.read_bytes(folder / POLICY, sha256=record["sha256"][POLICY], max_bytes=MAX_POLICY_BYTES)
     policy = build_policy(config)
     try:
-        tensors = safetensors.torch.load(data)
-        for name, weights in policy.actor_state_dict().items():
-            if name in tensors and tensors[name].dtype != weights.dtype:
-                raise ValueError(f"{name} has dtype {tensors[name].dtype}")
-        policy.actor.load_state_dict(tensors)
+        _load_weights(policy, data)
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
-        raise files.DamagedFileError(path, f"does not hold this policy's weights: {str(error)[:200]}") from error
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise files.DamagedFileError(path, "contains weights that are not finite")
+        reason = f"does not hold this policy's weights: {_one_line(error)}"
+        raise files.DamagedFileError(folder / POLICY, reason) from error
     policy.set_training_mode(False)
     return policy, config, record
+
+
+def _load_weights(policy: MADDPGPolicy, data: bytes) -> None:
+    """Put the weights of a ``policy.safetensors`` into the actors; raise an error unless it holds just those."""
+    if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
+        raise ValueError(f"its header is larger than the {MAX_HEADER_BYTES} bytes allowed")
+    tensors = safetensors.torch.load(data)
+    for name, weights in policy.actor_state_dict().items():
+        if name in tensors and tensors[name].dtype != weights.dtype:
+            raise ValueError(f"{name} has dtype {tensors[name].dtype}")
+    policy.actor.load_state_dict(tensors)
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise ValueError("some are not finite")
+
+
+def _no_run(path: Path) -> str:
+    """Say why a file is not a run folder."""
+    if not zipfile.is_zipfile(path):
+        return "a file, not the folder of a run"
+    return (
+        "a zip-file, which can run code when it is loaded, and only safetensors and JSON are read; if it is a model "
+        "that you trust: load_policy(..., trusted=True) in Python"
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def config_of(record: dict[str, Any], folder: Path) -> Config:
@@ -216,4 +271,4 @@ def config_of(record: dict[str, Any], folder: Path) -> Config:
     try:
         return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
     except ValueError as error:
-        raise files.DamagedFileError(folder / "run.json", f"config: {error}") from error
+        raise files.DamagedFileError(folder / "run.json", f"config: {str(error)[:500]}") from error

@@ -172,7 +172,7 @@ def read_runs(folder: str | Path) -> list[Run]:
     :raises files.DamagedFileError: for a folder that is no run folder or a file that is not what the run wrote, by name
     """
     runs = [
-        _read_run(seed_folder, Cell(method_folder.name, _setting(setting_folder)), _seed(seed_folder))
+        _read_run(seed_folder, Cell(method_folder.name, read_setting(setting_folder)), _seed(seed_folder))
         for method_folder in _subfolders(Path(folder))
         for setting_folder in _subfolders(method_folder)
         for seed_folder in _subfolders(setting_folder)
@@ -187,7 +187,7 @@ def _subfolders(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
 
 
-def _setting(folder: Path) -> Setting:
+def read_setting(folder: Path) -> Setting:
     """Return what a folder's name says; another spelling of its numbers would be a second folder of one cell."""
     match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", folder.name)
     if match is None:

@@ -3,7 +3,7 @@
 import io
 import pathlib
 import warnings
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -460,6 +461,33 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
+    """Return the policy of a zip-file that ``save`` of MADDPG or a subclass wrote, to act with: no critic is loaded.
+
+    **Such a file can run code when it is loaded: load only files that you trust.**
+
+    :param path: the file
+    :raises ValueError: if it is no zip-file, or not of such a model; unpickling it may raise anything else
+    """
+    data, parameters, _ = load_from_zip_file(path, device="cpu")
+    needed = ("policy_class", "observation_space", "action_space", "n_agents", "critic_kind", "policy_kwargs")
+    if not data or "policy" not in parameters or not data.keys() >= set(needed):
+        raise ValueError("not a model of MADDPG")
+    policy: MADDPGPolicy = data["policy_class"](
+        data["observation_space"],
+        data["action_space"],
+        lambda _: 0.0,
+        n_agents=data["n_agents"],
+        critic=data["critic_kind"],
+        **data["policy_kwargs"],
+    )
+    saved = cast(dict[str, th.Tensor], parameters["policy"])
+    prefix = "actor."
+    policy.actor.load_state_dict({name.removeprefix(prefix): saved[name] for name in saved if name.startswith(prefix)})
+    policy.set_training_mode(False)
+    return policy
 
 
 def count_agents(env: GymEnv | None, n_agents: int | None) -> int:

@@ -247,6 +247,8 @@ class MADDPGPolicy(BasePolicy):
     actor_target: Actor
     critic: CentralCritic
     critic_target: CentralCritic
+    agents: tuple[str, ...] | None = None
+    """The agents' names in the order of the slots, where they are known: whose observation is whose in a dict."""
 
     def __init__(
         self,
@@ -384,7 +386,8 @@ class MADDPGPolicy(BasePolicy):
         """Actions for the agents of one or more worlds.
 
         :param observation: world-major slots, shape (B * N, *O), one world, (N, *O), or a dict of the agents'
-            observations, each (*O), in the order of the environment's ``possible_agents``
+            observations, each (*O): by name where the policy knows the ``agents``, else in the order of the
+            environment's ``possible_agents``
         :param state: unused, SB3's interface
         :param episode_start: unused, SB3's interface
         :param deterministic: unused: the actors are deterministic
@@ -393,12 +396,13 @@ class MADDPGPolicy(BasePolicy):
         """
         if not isinstance(observation, Mapping):
             return super().predict(observation, state, episode_start, deterministic)
-        if len(observation) != self.n_agents:
-            raise ValueError(
-                f"predict needs the observations of all {self.n_agents} agents, but got {list(observation)}"
-            )
-        actions, state = super().predict(np.stack(list(observation.values())), state, episode_start, deterministic)
-        return dict(zip(observation, actions, strict=True)), state
+        agents = self.agents or tuple(observation)
+        if len(agents) != self.n_agents or set(agents) != set(observation):
+            wanted = ", ".join(self.agents) if self.agents else f"all {self.n_agents} agents"
+            raise ValueError(f"predict needs the observations of {wanted}, but got {list(observation)}")
+        slots = np.stack([observation[agent] for agent in agents])
+        actions, state = super().predict(slots, state, episode_start, deterministic)
+        return dict(zip(agents, actions, strict=True)), state
 
     def actor_state_dict(self) -> dict[str, th.Tensor]:
         """All that is needed to act: the actors' weights as plain named tensors on the CPU."""

@@ -10,17 +10,22 @@ import numpy as np
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import bounds
-from marl_encircle.core.scenes import SCENES
 from marl_encircle.envs.view import View
 from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import Config, load_config
-from marl_encircle.experiments.grid import load_grid
-from marl_encircle.experiments.library import reward_names
-from marl_encircle.experiments.records import Cell, Setting, run_path
+from marl_encircle.experiments.pretrained import (
+    USUAL_SETTING,
+    find_run,
+    first_run,
+    in_words,
+    is_run_path,
+    pretrained_runs,
+    setting_of,
+)
+from marl_encircle.experiments.records import Cell
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.replay import Replay, record_round
-from marl_encircle.spelling import nearest
 
 WATCHED_SEED = 7000
 """Evaluation seed of the rounds that are shown unless another is asked for: neither trained on nor reported."""
@@ -49,7 +54,7 @@ class Side:
 def find_match(
     what: str,
     versus: str | None,
-    results: Path,
+    results: Path | None,
     fields: Mapping[str, Any],
     scene: str | None,
     policy: Path | None,
@@ -71,7 +76,7 @@ def find_match(
 
 def find_side(
     what: str,
-    results: Path,
+    results: Path | None = None,
     fields: Mapping[str, Any] | None = None,
     scene: str | None = None,
     policy: Path | None = None,
@@ -80,24 +85,27 @@ def find_side(
 
     :param what: a method's name: the first training seed of its setting; a run folder; or the YAML file of a reward,
         which the policy of another run is watched under
-    :param results: the folder of ``runs/``
+    :param results: the folder of ``runs/``; by default ``results``, and for what it lacks the package's own runs
     :param fields: speed ratio, pursuers and obstacles as far as they are asked for; 1.1, 3 and 1 choose a method's run
     :param scene: play in a scene of this name
     :param policy: a run folder; whose policy is watched under the reward ``what``
     :raises ConfigError: if there is none, naming what there is
     :raises DamagedFileError: if a run is not what its record says
     """
-    if scene is not None and scene not in SCENES:
-        raise ConfigError(f"scene {scene!r:.80}: unknown scene{nearest(scene, SCENES)}")
-    is_folder = _is_folder(what)
+    wanted = setting_of({"scene": scene or USUAL_SETTING.scene, **(fields or {})})
+    is_folder = not _is_yaml(what) and is_run_path(what)
     if _is_yaml(what) and policy is None:
         raise ConfigError(f"{what} is a reward without a policy: add --policy RUN_DIR, or train one with it")
     if is_folder and policy is not None:
         raise ConfigError(f"{what} is a run folder, whose policy is its own; --policy goes with a reward")
-    wanted = Setting(
-        **{"speed_ratio": 1.1, "pursuers": 3, "obstacles": 1, "scene": scene or "random", **(fields or {})}
-    )
-    folder = policy or (Path(what) if is_folder else find_run(what, wanted, results))
+    folders = [results / "runs"] if results else [Path("results", "runs"), pretrained_runs()]
+    if policy is not None:
+        folder = policy
+    elif is_folder:
+        folder = Path(what)
+    else:  # who was not trained in a scene plays it as trained in the usual one
+        trained_in = first_run(Cell(what, wanted), folders)
+        folder = trained_in or find_run(what, wanted._replace(scene=USUAL_SETTING.scene), folders)
     actors, config, record = load_run(folder)
     has = config.cell.setting
     if any(getattr(has, name) != value for name, value in (fields or {}).items()):
@@ -127,48 +135,6 @@ def _in_scene(config: Config, scene: str, folder: Path) -> Config:
     return config.model_copy(update={"scenario": scenario})
 
 
-def find_run(method: str, setting: Setting, results: Path) -> Path:
-    """Return the run of a method's first training seed, in this setting or else in its random scene.
-
-    :raises ConfigError: naming the settings that there are, and the command that trains this one
-    """
-    runs = results / "runs"
-    there = {path.name for path in runs.iterdir() if path.is_dir()} if runs.is_dir() else set()
-    if method not in there | set(reward_names()):
-        raise ConfigError(f"{method!r:.80}: no method, run folder or YAML file{nearest(method, sorted(there))}")
-    for scene in dict.fromkeys((setting.scene, "random")):
-        cell = Cell(method, setting._replace(scene=scene))
-        for candidate in (cell, load_grid("committed").aliases.get(cell, cell)):
-            folder = runs / run_path(candidate, 0).parent
-            seeds = [
-                int(path.parent.name.removeprefix("seed"))
-                for path in folder.glob("seed*/run.json")
-                if path.parent.name.removeprefix("seed").isdigit()
-            ]
-            if seeds:
-                return runs / run_path(candidate, min(seeds))
-    settings = sorted({path.parent.parent.name for path in (runs / method).glob("*/seed*/run.json")})
-    known = f"there are {', '.join(settings)}" if settings else "it has none at all"
-    options = f"--speed-ratio {setting.speed_ratio:g} --pursuers {setting.pursuers} --obstacles {setting.obstacles}"
-    raise ConfigError(
-        f"{runs}: no run of {method} {in_words(setting)}; {known}. Train one: marl-encircle train --reward {method} "
-        f"{options}"
-    )
-
-
-def in_words(setting: Setting) -> str:
-    """Return a setting in words."""
-    pursuers = f"{setting.pursuers} pursuer{'s' if setting.pursuers != 1 else ''}"
-    obstacles = f"{setting.obstacles} obstacle{'s' if setting.obstacles != 1 else ''}"
-    return f"with {pursuers} and {obstacles} at speed ratio {setting.speed_ratio:g}"
-
-
-def _is_folder(what: str) -> bool:
-    """Whether a run folder is meant rather than a name."""
-    path = Path(what)
-    return not _is_yaml(what) and (len(path.parts) > 1 or (path / "run.json").exists())
-
-
 def _is_yaml(what: str) -> bool:
     return what.lower().endswith((".yaml", ".yml"))
 
@@ -188,7 +154,7 @@ class Match:
         settings = [side.config.cell.setting for side in sides]
         for setting in settings[1:]:
             if setting != settings[0]:
-                words = " and ".join(f"{in_words(each)} (scene {each.scene})" for each in settings)
+                words = " and ".join(map(in_words, settings))
                 raise ConfigError(f"not the same rounds: {words}")
 
     def _replays(self, number: int) -> tuple[Replay, ...]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,14 @@ from tiny_runs import copy_of_finished, finished, tiny
 from marl_encircle import files
 from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
+from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.build import (
     NoiseSchedule,
     build_model,
+    build_policy,
     build_vec_env,
     load_policy,
     load_run,
@@ -254,11 +257,16 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "another hash": (
         lambda f: edit_record(f, lambda r: r["sha256"].update({"policy.safetensors": "0" * 64})),
         "policy.safetensors: changed since it was written"),
+    "many keys": (
+        lambda f: edit_record(f, lambda r: r["config"]["reward"].update({str(i): 0 for i in range(9999)})),
+        "reward.0: unknown key"),
     "no policy": (lambda f: (f / "policy.safetensors").unlink(), "policy.safetensors: the file is missing"),
     "other bytes": (write("policy.safetensors", b"x"), "policy.safetensors: changed since it was written"),
     "pickle": (lambda f: (write("policy.safetensors", b"\x80\x04N.")(f), edit_record(
         f, lambda r: r["sha256"].update({"policy.safetensors": files.sha256_bytes(b"\x80\x04N.")}))),
         "policy.safetensors: does not hold this policy's weights"),
+    "large header": (lambda f: rewrite_policy(f, lambda t: t.update({str(i): th.ones(0) for i in range(2000)})),
+        "its header is larger than"),
     "not finite": (lambda f: rewrite_policy(f, lambda t: next(iter(t.values())).fill_(math.nan)), "not finite"),
     "a name": (lambda f: rewrite_policy(f, lambda t: t.update(other=t.pop(next(iter(t))))), "does not hold"),
     "one more": (lambda f: rewrite_policy(f, lambda t: t.update(other=th.ones(1))), "does not hold"),
@@ -279,3 +287,77 @@ def test_a_damaged_run_is_refused_by_file_and_reason(tmp_path: Path, damage: str
     assert reason in str(caught.value)
     assert str(folder) in str(caught.value)
     assert len(str(caught.value)) < 700
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_a_folder_and_the_policy_in_it_are_one(trusted: bool) -> None:
+    own = (finished() / "policy.safetensors").read_bytes()
+    for what in (finished(), str(finished()), finished() / "policy.safetensors"):
+        assert policy_bytes(load_policy(what, trusted=trusted)) == own
+
+
+def test_a_policy_knows_whose_observation_is_whose() -> None:
+    policy = load_policy(finished())
+    env = encirclement_v0.parallel_env(tiny().scenario)
+    observations, _ = env.reset(seed=3)
+    steps = 0
+    while env.agents:
+        actions, _ = policy.predict(observations)
+        slots, _ = policy.predict(np.stack(list(observations.values())))
+        shuffled, _ = policy.predict({agent: observations[agent] for agent in reversed(env.agents)})
+        assert isinstance(actions, dict)
+        assert isinstance(shuffled, dict)
+        for slot, agent in enumerate(env.agents):
+            assert np.array_equal(actions[agent], slots[slot])
+            assert np.array_equal(shuffled[agent], slots[slot])
+        observations, *_ = env.step(actions)
+        steps += 1
+    assert 1 <= steps <= 20
+    for others in ({}, {"pursuer_0": observations["pursuer_0"]}, dict(zip("abc", observations.values(), strict=True))):
+        with pytest.raises(ValueError, match="observations of pursuer_0, pursuer_1, pursuer_2, but got"):
+            policy.predict(others)
+
+
+def test_critics_that_are_not_read_cost_next_to_nothing() -> None:
+    """Whatever a configuration says: 64 critics of this size would have 300 MB of weights."""
+    large = tiny(pursuers=64, obstacles=0, pursuer_radius=0.01, overrides=["algorithm.net_arch=[100]"])
+    policy = build_policy(large)
+    critics = sum(weights.numel() for weights in policy.critic.parameters())
+    assert critics < sum(weights.numel() for weights in policy.actor.parameters())
+
+
+# models of Stable-Baselines3
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "matd3"])
+def test_the_actors_of_a_trusted_zip_act_as_the_model_does(tmp_path: Path, algorithm: str) -> None:
+    config = load_config(algorithm=algorithm, profile="smoke")
+    model = build_model(config, build_vec_env(config, 2), 5)
+    model.save(tmp_path / "model")
+    policy = load_policy(tmp_path / "model.zip", trusted=True)
+    observations = np.random.default_rng(0).uniform(-1, 1, (6, *model.observation_space.shape))  # type: ignore[misc]
+    assert np.array_equal(policy.predict(observations)[0], model.predict(observations)[0])
+    assert policy_bytes(policy) == policy_bytes(model.policy)
+    assert not policy.training
+
+
+def test_a_zip_is_not_read_unless_it_is_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(profile="smoke")
+    build_model(config, build_vec_env(config, 2), 5).save(tmp_path / "model.zip")
+    monkeypatch.chdir(tmp_path)
+    for what in ("model.zip", "./model.zip", tmp_path / "model.zip"):
+        with pytest.raises(files.DamagedFileError, match=r"model\.zip: a zip-file, which can run code .* trusted=True"):
+            load_policy(what)
+
+
+def test_a_trusted_zip_without_actors_is_refused(tmp_path: Path) -> None:
+    config = load_config(profile="smoke")
+    build_model(config, build_vec_env(config, 2), 5).save(tmp_path / "model.zip")
+    whole = (tmp_path / "model.zip").read_bytes()
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("data", json.dumps({"n_agents": 3}))
+    (tmp_path / "flipped.zip").write_bytes(bytes([*whole[:2000], whole[2000] ^ 1, *whole[2001:]]))
+    (tmp_path / "cut.zip").write_bytes(whole[:-1000])
+    for name, reason in (("other", "not a model of MADDPG"), ("flipped", "Error"), ("cut", "")):
+        with pytest.raises(files.DamagedFileError, match=rf"{name}\.zip: holds no actors: .*{reason}"):
+            load_policy(tmp_path / f"{name}.zip", trusted=True)

@@ -23,11 +23,12 @@ from marl_encircle.envs.render import LOW_SCENE, PANEL, SCENE, array_of, draw_lo
 from marl_encircle.envs.view import Layer, Layers
 from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.pretrained import find_run
 from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays import film, player
 from marl_encircle.replays.player import BAR, SPEEDS, Player, timeline
-from marl_encircle.replays.watch import Match, Side, end_of, find_match, find_run, find_side, fresh_seed
+from marl_encircle.replays.watch import Match, Side, end_of, find_match, find_side, fresh_seed
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
 REWARD = "name: my_idea\nclosure: pursuers\nterms:\n  contributing_angle: 1.0\n"
@@ -72,9 +73,9 @@ def test_a_method_is_its_first_training_seed(results: Path) -> None:
     for seed in (11, 2):
         shutil.copytree(folder, folder.parent / f"seed{seed}")
     (folder.parent / "seed1").mkdir()  # unfinished
-    assert find_run("ours", tiny().cell.setting, results) == folder
+    assert find_side("ours", results).folder == folder
     folder.rename(folder.parent / "seed30")
-    assert find_run("ours", tiny().cell.setting, results).name == "seed2"
+    assert find_run("ours", tiny().cell.setting, [results / "runs"]).name == "seed2"
 
 
 def test_a_method_that_has_the_runs_of_another_is_shown_with_them(results: Path) -> None:
@@ -82,7 +83,7 @@ def test_a_method_that_has_the_runs_of_another_is_shown_with_them(results: Path)
     without = folder.parent.with_name("ratio1.1_n3_m0_random") / "seed0"
     without.parent.mkdir()
     folder.rename(without)
-    assert find_run("model_a", tiny(obstacles=0).cell.setting, results) == without
+    assert find_run("model_a", tiny(obstacles=0).cell.setting, [results / "runs"]) == without
 
 
 def test_other_scenes_are_played_by_the_policy_of_the_random_one(results: Path) -> None:
