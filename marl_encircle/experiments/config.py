@@ -5,14 +5,11 @@ A configuration has five sections, each read from the file that :mod:`marl_encir
 """
 
 import dataclasses
-import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -30,8 +27,10 @@ from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
+from marl_encircle.experiments.faults import explain, naming_files
+from marl_encircle.experiments.overrides import parse_overrides
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, parse_yaml
+from marl_encircle.experiments.yaml_files import ConfigError, merge
 from marl_encircle.maddpg import ALGORITHMS
 from marl_encircle.spelling import nearest
 
@@ -177,7 +176,7 @@ class Config(Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved configuration as plain data."""
         sections = self.model_dump(exclude={"scenario"})
-        return {"reward": sections.pop("reward"), "scenario": _fields_of(self.scenario), **sections}
+        return {"reward": sections.pop("reward"), "scenario": fields_of(self.scenario), **sections}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
@@ -188,7 +187,7 @@ class Config(Section):
         scenario = values.get("scenario", {}) if isinstance(values, Mapping) else None
         if not isinstance(scenario, Mapping):
             raise ConfigError(f"a configuration and its scenario must be mappings; got {values!r:.80}")
-        return _checked(_build_scenario(scenario), {key: value for key, value in values.items() if key != "scenario"})
+        return _checked(build_scenario(scenario), {key: value for key, value in values.items() if key != "scenario"})
 
     @property
     def cell(self) -> Cell:
@@ -224,18 +223,18 @@ def load_config(
     reward, algorithm = _name_of(reward, "reward"), _name_of(algorithm, "algorithm")
     if profile not in get_args(Profile):
         raise ConfigError(f"profile {profile!r:.80}: unknown profile{nearest(str(profile), get_args(Profile))}")
-    changes = _parse_overrides(overrides)
+    changes = parse_overrides(overrides, Config.model_fields)
     changes["scenario"] = merge(fields or {}, changes.get("scenario", {}))
     names = {"reward": reward, "algorithm": algorithm, "evaluation": profile}
     if isinstance(scenario, Scenario):
-        own_fields = _fields_of(scenario)
+        own_fields = fields_of(scenario)
     else:
         names["scenario"] = _name_of(scenario, "scenario")
         own_fields = library.load_section("scenario", names["scenario"])
-    with _naming_files(names, {}):
+    with naming_files(names, {}):
         _check_fields(own_fields)  # also those that a change would hide
-    with _naming_files(names, changes):
-        world = _build_scenario(merge(own_fields, changes["scenario"]))
+    with naming_files(names, changes):
+        world = build_scenario(merge(own_fields, changes["scenario"]))
     names["training"] = profile if world.solvable_without_obstacles else f"{profile}_obstacles"
     sections = {
         "reward": library.load_reward(reward),
@@ -247,52 +246,8 @@ def load_config(
     named = merged["reward"].get("name")
     if named == Path(reward).stem and not re.match(METHOD_NAME, named):
         raise ConfigError(f"{reward}: {named!r:.80} is not a method name; add 'name:' with letters, digits, _ . or -")
-    with _naming_files(names, changes):
+    with naming_files(names, changes):
         return _checked(world, merged)
-
-
-def check_seed(config: Config, seed: int) -> None:
-    """Refuse a training seed whose worlds are those of the evaluation.
-
-    :raises ConfigError: also if it is no integer from 0 to 2**32 - 1
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 32:
-        raise ConfigError(f"seed must be an integer from 0 to {(1 << 32) - 1}; got {seed!r:.80}")
-    for name in ("seed", "curve_seed"):
-        if seed == getattr(config.evaluation, name):
-            raise ConfigError(
-                f"seed must differ from evaluation.{name}: the training would see the evaluation's rounds; got {seed}"
-            )
-
-
-def check_training(config: Config) -> None:
-    """Refuse a training that would learn nothing or not fit into this machine's memory; an environment may do both.
-
-    :raises ConfigError: naming the keys
-    """
-    check_curriculum(config)
-    random, total = config.algorithm.random_world_steps, config.training.world_steps
-    if random >= total:
-        raise ConfigError(
-            f"algorithm.random_world_steps: must be less than training.world_steps, {total}, or nothing is "
-            f"learnt; got {random}"
-        )
-    _check_memory(config)
-
-
-def check_curriculum(config: Config) -> None:
-    """Refuse a curriculum that starts where the scene is not allowed; only who trains by it needs one.
-
-    :raises ConfigError: naming the key and how to change it
-    """
-    for name, ramp in config.training.curriculum.items():
-        if ramp is not None:
-            key = f"training.curriculum.{name}"
-            try:
-                _build_scenario({**_fields_of(config.scenario), name: ramp.start})
-            except ConfigError as error:
-                remedy = f"--set {key}.start=... to another value, or --set {key}=null for none"
-                raise ConfigError(f"{key}.start: {error}; {remedy}") from error
 
 
 def difference(
@@ -302,37 +257,20 @@ def difference(
 
     :param where: what to call the two
     """
-    mine, other = dict(_flat(here)), dict(_flat(there))
     return [
-        f"{key}: {mine.get(key, 'missing')} {where[0]}, {other.get(key, 'missing')} {where[1]}"
-        for key in dict.fromkeys([*mine, *other])
-        if mine.get(key, "missing") != other.get(key, "missing")
+        f"{key}: {mine} {where[0]}, {other} {where[1]}"
+        for key, (mine, other) in differing(here, there, "missing").items()
     ]
 
 
-def _parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
-    changes: dict[str, Any] = {}
-    if isinstance(overrides, str) or not isinstance(overrides, Sequence):
-        raise ConfigError(f"overrides must be a list of section.key=value; got {overrides!r:.80}")
-    for override in overrides:
-        if not isinstance(override, str):
-            raise ConfigError(f"overrides must be a list of section.key=value; one is {override!r:.80}")
-        path, separator, text = override.partition("=")
-        keys = path.strip().split(".")
-        if not separator or len(keys) < 2 or not all(keys):
-            raise ConfigError(f"--set {override:.80}: must be section.key=value")
-        if keys[0] not in Config.model_fields:
-            raise ConfigError(f"--set {override:.80}: unknown section{nearest(keys[0], Config.model_fields)}")
-        try:
-            value = parse_yaml(text)
-        except ConfigError as error:
-            raise ConfigError(f"--set {override:.80}: {error}") from error
-        if value == {}:
-            raise ConfigError(f"--set {override:.80}: mappings are merged, so an empty one changes nothing; use null")
-        for key in reversed(keys):
-            value = {key: value}
-        changes = merge(changes, value)
-    return changes
+def differing(here: Mapping[str, Any], there: Mapping[str, Any], absent: Any = None) -> dict[str, tuple[Any, Any]]:
+    """Return both values of each key, ``section.key``, whose value differs.
+
+    :param absent: what stands for the value of a key that only one of them has
+    """
+    mine, other = dict(_flat(here)), dict(_flat(there))
+    pairs = {key: (mine.get(key, absent), other.get(key, absent)) for key in dict.fromkeys([*mine, *other])}
+    return {key: (first, second) for key, (first, second) in pairs.items() if first != second}
 
 
 def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
@@ -350,7 +288,11 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
     return config
 
 
-def _build_scenario(values: Mapping[str, Any]) -> Scenario:
+def build_scenario(values: Mapping[str, Any]) -> Scenario:
+    """Return the scenario of plain values.
+
+    :raises ConfigError: naming the key
+    """
     known = [f.name for f in dataclasses.fields(Scenario)]
     for key in values:
         if key not in known:
@@ -366,13 +308,14 @@ def _build_scenario(values: Mapping[str, Any]) -> Scenario:
 def _check_fields(values: Mapping[str, Any]) -> None:
     """Refuse a field that is wrong whatever the others are."""
     try:
-        _build_scenario(values)
+        build_scenario(values)
     except ConfigError as error:
         if str(error).startswith("scenario."):
             raise
 
 
-def _fields_of(scenario: Scenario) -> dict[str, Any]:
+def fields_of(scenario: Scenario) -> dict[str, Any]:
+    """Return a scenario as plain values."""
     return {**dataclasses.asdict(scenario), "observe_extras": list(scenario.observe_extras)}
 
 
@@ -392,98 +335,35 @@ def _name_of(given: object, kind: str) -> str:
     return str(given)
 
 
-@contextmanager
-def _naming_files(names: Mapping[str, str], changes: Mapping[str, Any]) -> Iterator[None]:
-    """Put the file in front of every line of a ConfigError that is about a key which stands in one.
-
-    :param names: of the sections' files
-    :param changes: values by section that stand in none
-    """
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError("\n".join(_with_file(line, names, changes) for line in str(error).splitlines())) from error
-
-
-def _with_file(line: str, names: Mapping[str, str], changes: Mapping[str, Any]) -> str:
-    section, *keys = line.split(":")[0].split(" ")[0].split(".")
-    if section not in names:
-        return line
-    for length in range(len(keys), -1, -1):  # a key that is missing stands where its mapping does
-        changed = changes.get(section, {})
-        if changed and holds(changed, keys[:length]):
-            return line
-        path = library.file_of(cast(library.Kind, section), names[section], keys[:length])
-        if path is not None:
-            return f"{path}: {line}"
-    return line
-
-
-def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
-    """Return one line for each thing that is wrong, with its key path, value and what is allowed.
-
-    :param model: what was to be built
-    """
-    lines = []
-    for item in error.errors():
-        path = ".".join(f"{part!s:.80}" for part in item["loc"] if part != "[key]")
-        if item["type"] == "extra_forbidden":
-            siblings = _known_keys(model, item["loc"][:-1])
-            lines.append(f"{path:.200}: unknown key{nearest(str(item['loc'][-1]), siblings)}")
-        elif item["type"] == "missing":
-            lines.append(f"{path}: missing")
-        else:
-            reason = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{path:.200}: {reason[:1].lower()}{reason[1:]}; got {item['input']!r:.80}")
-    return lines
-
-
-def _known_keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the section at a path."""
-    annotation: Any = model
-    for part in path:
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel) and isinstance(part, str):
-            annotation = annotation.model_fields[part].annotation
-        else:  # an entry of a list or dictionary of sections, or None
-            inner = [each for each in get_args(annotation) if each not in (str, NoneType)]
-            annotation = inner[-1]
-    sections = [each for each in (annotation, *get_args(annotation)) if isinstance(each, type)]
-    return [name for each in sections if issubclass(each, BaseModel) for name in each.model_fields]
-
-
 def _check_networks(config: Config) -> None:
     """Refuse networks so large that the policy could not be read back, or that nobody wants to allocate."""
-    a, n = config.algorithm, config.scenario.pursuers
-    joint = n * (_observation_size(config) + 2)
-    actor = n * _weights([_observation_size(config), *a.net_arch, 2])
-    critics = n * _weights([joint, *a.net_arch, 1]) if a.critic == "per_agent" else _weights([joint, *a.net_arch, n])
-    for role, weights, limit in (("actors", actor, MAX_POLICY_BYTES // 2), ("critics", critics, 1 << 29)):
-        if 4 * weights > limit:
+    limits = {"actors": MAX_POLICY_BYTES // 2, "critics": 1 << 29}
+    for role, weights in count_weights(config).items():
+        if 4 * weights > limits[role]:
             raise ConfigError(
                 f"algorithm.net_arch: the {role} would have {4 * weights / 1e6:.0f} MB of weights; "
-                f"at most {limit / 1e6:.0f} MB"
+                f"at most {limits[role] / 1e6:.0f} MB"
             )
+
+
+def count_weights(config: Config) -> dict[str, int]:
+    """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
+    a, n, size = config.algorithm, config.scenario.pursuers, observation_size(config)
+    joint = n * (size + 2)
+    shared = a.critic == "shared"
+    return {
+        "actors": n * _weights([size, *a.net_arch, 2]),
+        "critics": _weights([joint, *a.net_arch, n]) if shared else n * _weights([joint, *a.net_arch, 1]),
+    }
 
 
 def _weights(sizes: list[int]) -> int:
     return sum((a + 1) * b for a, b in pairwise(sizes))
 
 
-def _observation_size(config: Config) -> int:
+def observation_size(config: Config) -> int:
+    """Return the number of values that a pursuer observes."""
     return int(list(layout(config.scenario).values())[-1].stop)
-
-
-def _check_memory(config: Config) -> None:
-    """Refuse what cannot fit into this machine's memory: the replay buffer and the worlds."""
-    n, size = config.scenario.pursuers, _observation_size(config)
-    steps = min(config.algorithm.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
-    needed = 4 * steps * n * (2 * size + 5) + 40 * config.training.n_worlds * config.scenario.n_directions
-    installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > installed:
-        raise ConfigError(
-            f"algorithm.buffer_world_steps, training.n_worlds: {needed / 1e9:.1f} GB of memory needed, "
-            f"but this machine has {installed / 1e9:.1f} GB"
-        )
 
 
 def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:

@@ -12,13 +12,13 @@ from marl_encircle.experiments.config import (
     Config,
     Profile,
     Section,
-    check_seed,
     difference,
-    explain,
     load_config,
 )
+from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.trainable import check_seed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 

@@ -35,11 +35,12 @@ from marl_encircle.experiments.callbacks import (
     Stopped,
     stop_signals,
 )
-from marl_encircle.experiments.config import Config, check_seed, check_training, difference
+from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import Episode, config_hash, episodes_to_csv, read_record, run_path
 from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
+from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError
 
 SCHEMA = 1

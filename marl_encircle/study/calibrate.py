@@ -20,12 +20,14 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, ValidationError
 
 from marl_encircle import files
-from marl_encircle.experiments.config import Profile, Section, check_seed, explain
+from marl_encircle.experiments.config import Profile, Section
+from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
 from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
+from marl_encircle.experiments.trainable import check_seed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.study.paper import reported_cells
 from marl_encircle.study.typeset import markdown

@@ -13,16 +13,11 @@ from marl_encircle import maddpg
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
-from marl_encircle.experiments.config import (
-    Config,
-    check_seed,
-    check_training,
-    difference,
-    load_config,
-)
+from marl_encircle.experiments.config import Config, difference, load_config
 from marl_encircle.experiments.library import reward_names
 from marl_encircle.experiments.records import config_hash
 from marl_encircle.experiments.train import run_folder
+from marl_encircle.experiments.trainable import check_training
 from marl_encircle.experiments.yaml_files import ConfigError
 
 
@@ -125,23 +120,6 @@ def test_obstacles_that_would_not_fit_at_first_start_at_a_quarter_of_the_scene(
     simulator = Simulator(config.scenario, n_worlds=16, seed=0)
     simulator.set_difficulty({"obstacle_radius": start})
     simulator.reset()
-
-
-@pytest.mark.parametrize(
-    ("ramp", "reason"),
-    [
-        ("speed_ratio={start: 0.5, world_steps: 9}", "speed_ratio.start: scenario.speed_ratio must be between"),
-        ("obstacle_radius={start: 0.9, world_steps: 9}", "obstacle_radius.start: scenario: too many bodies"),
-        ("obstacle_radius={start: 1e200, world_steps: 9}", "obstacle_radius.start: scenario: the bodies are too large"),
-    ],
-)
-def test_a_first_value_that_cannot_be_played_is_refused_for_a_training_with_the_remedy(ramp: str, reason: str) -> None:
-    config = load_config(overrides=[f"training.curriculum.{ramp}"])  # which may be shown
-    with pytest.raises(ConfigError) as caught:
-        check_training(config)
-    key = "training.curriculum." + ramp.partition("=")[0]
-    assert str(caught.value).startswith(f"training.curriculum.{reason}")
-    assert str(caught.value).endswith(f"; --set {key}.start=... to another value, or --set {key}=null for none")
 
 
 def start_of_radius(config: Config) -> float:
@@ -328,33 +306,6 @@ def assert_short(message: str) -> None:
         assert "9" * 81 not in line
 
 
-def test_what_is_wrong_is_told_with_the_file_that_says_it(tmp_path: Path) -> None:
-    base = write(tmp_path, "base.yaml", "base: ours\nscale: true\nterms: {time: [3]}\n")
-    top = write(tmp_path, "top.yaml", "base: base.yaml\nclosure: both\n")
-    assert refused(top).splitlines() == [
-        f"{top}: reward.closure: input should be 'all' or 'pursuers'; got 'both'",
-        f"{base}: reward.scale: input should be a valid number; got True",
-    ]
-    assert refused(top, overrides=["reward.closure=all", "reward.scale=1"]).startswith(
-        f"{base}: reward.terms.time.weight must be a finite number"
-    )
-    assert refused(top, overrides=["reward.closure=any", "reward.scale=1"]).startswith("reward.closure: ")
-    algorithm = write(tmp_path, "mine.yaml", "base: maddpg\nupdates: 3\n")
-    assert refused(algorithm=algorithm).startswith(f"{algorithm}: algorithm.updates: unknown key; known: actor_")
-
-
-def test_a_scenarios_file_is_told_also_where_a_change_would_hide_its_fault(tmp_path: Path) -> None:
-    path = write(tmp_path, "mine.yaml", "accelerat: 3\n")
-    assert refused(scenario=path) == f"{path}: scenario.accelerat: unknown key; did you mean acceleration?"
-    path = write(tmp_path, "mine.yaml", "speed_ratio: 0.3\n")
-    for changes in ({}, {"speed_ratio": 1.2}):
-        assert refused(scenario=path, fields=changes).startswith(f"{path}: scenario.speed_ratio must be between")
-    path = write(tmp_path, "mine.yaml", "obstacles: 30\n")
-    assert refused(scenario=path).startswith(f"{path}: scenario: too many bodies")
-    assert load_config(scenario=path, fields={"obstacles": 2}).scenario.obstacles == 2
-    assert refused(scenario=path, fields={"pursuers": 4}).startswith("scenario: too many bodies")
-
-
 def test_a_scenario_may_be_given_as_it_is() -> None:
     scenario = Scenario(pursuers=4, observe_extras=("stage",))
     assert load_config(scenario=scenario).scenario == scenario
@@ -365,12 +316,6 @@ def test_there_are_many_cases() -> None:
     assert len(yaml_cases.REWARD_FILES) + len(yaml_cases.OVERRIDES) + len(yaml_cases.ARGUMENTS) >= 80
 
 
-def test_every_fault_of_a_file_is_told_at_once() -> None:
-    overrides = ["reward.scale=true", "training.n_worlds=0", "algorithm.gama=1"]
-    lines = refused(overrides=overrides).splitlines()
-    assert [line.partition(":")[0] for line in lines] == ["reward.scale", "algorithm.gama", "training.n_worlds"]
-
-
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     assert "not a regular file" in refused(str(tmp_path / "folder.yaml"))
@@ -378,57 +323,6 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     assert "not a regular file" in refused(str(tmp_path / "pipe.yaml"))
     assert "No such file" in refused(str(tmp_path / "absent.yaml"))
     assert "No such file" in refused("ablations/absent.yml")
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["algorithm.buffer_world_steps=10000000000", "training.world_steps=10000000000"],
-        ["training.n_worlds=65536", "scenario.n_directions=4096", "scenario.pursuers=64", "scenario.obstacles=0",
-         "scenario.pursuer_radius=0.01", "algorithm.buffer_world_steps=1000000000", "training.world_steps=1000000000"],
-    ],
-)  # fmt: skip
-def test_what_would_not_fit_into_memory_is_refused(overrides: Sequence[str]) -> None:
-    config = load_config(overrides=overrides)  # which may be shown, and its environment built
-    with pytest.raises(ConfigError, match="GB of memory needed, but this machine has"):
-        check_training(config)
-
-
-def test_a_buffer_is_no_larger_than_its_training() -> None:
-    check_training(load_config(profile="smoke", overrides=["algorithm.buffer_world_steps=10000000000"]))
-
-
-@pytest.mark.parametrize("profile", ["full", "smoke"])
-@pytest.mark.parametrize("pursuers", [2, 3])
-def test_a_training_without_learning_is_refused(profile: Any, pursuers: int) -> None:
-    def check(random: int) -> None:
-        how = [f"algorithm.random_world_steps={random}", "training.world_steps=12000"]
-        check_training(load_config(profile=profile, fields={"pursuers": pursuers}, overrides=how))
-
-    check_training(load_config(profile=profile, fields={"pursuers": pursuers}))
-    check(11999)
-    for random in (12000, 20000):
-        with pytest.raises(ConfigError, match=f"random_world_steps: must be less than .* 12000.*; got {random}"):
-            check(random)
-
-
-@pytest.mark.parametrize(
-    ("seed", "reason"),
-    [
-        (1000, r"seed must differ from evaluation\.seed: the training would see the evaluation's rounds; got 1000"),
-        (2000, r"seed must differ from evaluation\.curve_seed: .*; got 2000"),
-        (-1, "seed must be an integer from 0 to 4294967295; got -1"),
-        (1 << 32, "seed must be an integer from 0 to 4294967295; got 4294967296"),
-        (True, "got True"),
-        (1.0, r"got 1\.0"),
-        ("1", "got '1'"),
-    ],
-)
-def test_a_training_seed_is_none_of_the_evaluations(seed: Any, reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        check_seed(load_config(), seed)
-    check_seed(load_config(), 999)
-    check_seed(load_config(overrides=["evaluation.seed=3"]), 1000)
 
 
 @pytest.mark.parametrize(

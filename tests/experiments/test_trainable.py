@@ -1,0 +1,151 @@
+"""A training that could not be carried out on this machine, or would learn nothing, is refused before it begins."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import tiny
+
+from marl_encircle.experiments import trainable
+from marl_encircle.experiments.build import build_model, build_vec_env
+from marl_encircle.experiments.checkpoint import REPLAY
+from marl_encircle.experiments.config import load_config, observation_size
+from marl_encircle.experiments.trainable import (
+    available_memory,
+    check_memory,
+    check_seed,
+    check_training,
+    memory_needed,
+)
+from marl_encircle.experiments.yaml_files import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("ramp", "reason"),
+    [
+        ("speed_ratio={start: 0.5, world_steps: 9}", "speed_ratio.start: scenario.speed_ratio must be between"),
+        ("obstacle_radius={start: 0.9, world_steps: 9}", "obstacle_radius.start: scenario: too many bodies"),
+        ("obstacle_radius={start: 1e200, world_steps: 9}", "obstacle_radius.start: scenario: the bodies are too large"),
+    ],
+)
+def test_a_first_value_that_cannot_be_played_is_refused_for_a_training_with_the_remedy(ramp: str, reason: str) -> None:
+    config = load_config(overrides=[f"training.curriculum.{ramp}"])  # which may be shown
+    with pytest.raises(ConfigError) as caught:
+        check_training(config)
+    key = "training.curriculum." + ramp.partition("=")[0]
+    assert str(caught.value).startswith(f"training.curriculum.{reason}")
+    assert str(caught.value).endswith(f"; --set {key}.start=... to another value, or --set {key}=null for none")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["algorithm.buffer_world_steps=10000000000", "training.world_steps=10000000000"],
+        ["training.n_worlds=65536", "scenario.n_directions=4096", "scenario.pursuers=64", "scenario.obstacles=0",
+         "scenario.pursuer_radius=0.01", "algorithm.buffer_world_steps=1000000000", "training.world_steps=1000000000"],
+    ],
+)  # fmt: skip
+def test_what_would_not_fit_into_memory_is_refused(overrides: Sequence[str]) -> None:
+    config = load_config(overrides=overrides)  # which may be shown, and its environment built
+    with pytest.raises(ConfigError, match="GB in all, but this machine has"):
+        check_training(config)
+
+
+def test_a_buffer_is_no_larger_than_its_training() -> None:
+    check_training(load_config(profile="smoke", overrides=["algorithm.buffer_world_steps=10000000000"]))
+
+
+@pytest.mark.parametrize("profile", ["full", "smoke"])
+@pytest.mark.parametrize("pursuers", [2, 3])
+def test_a_training_without_learning_is_refused(profile: Any, pursuers: int) -> None:
+    def check(random: int) -> None:
+        how = [f"algorithm.random_world_steps={random}", "training.world_steps=12000"]
+        check_training(load_config(profile=profile, fields={"pursuers": pursuers}, overrides=how))
+
+    check_training(load_config(profile=profile, fields={"pursuers": pursuers}))
+    check(11999)
+    for random in (12000, 20000):
+        with pytest.raises(ConfigError, match=f"random_world_steps: must be less than .* 12000.*; got {random}"):
+            check(random)
+
+
+@pytest.mark.parametrize(
+    ("seed", "reason"),
+    [
+        (1000, r"seed must differ from evaluation\.seed: the training would see the evaluation's rounds; got 1000"),
+        (2000, r"seed must differ from evaluation\.curve_seed: .*; got 2000"),
+        (-1, "seed must be an integer from 0 to 4294967295; got -1"),
+        (1 << 32, "seed must be an integer from 0 to 4294967295; got 4294967296"),
+        (True, "got True"),
+        (1.0, r"got 1\.0"),
+        ("1", "got '1'"),
+    ],
+)
+def test_a_training_seed_is_none_of_the_evaluations(seed: Any, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        check_seed(load_config(), seed)
+    check_seed(load_config(), 999)
+    check_seed(load_config(overrides=["evaluation.seed=3"]), 1000)
+
+
+def test_the_memory_that_is_needed_is_that_of_the_arrays() -> None:
+    config = load_config(
+        fields={"pursuers": 3, "obstacles": 1, "n_directions": 72},
+        overrides=["algorithm.buffer_world_steps=1000", "algorithm.batch_size=10", "training.n_worlds=5"],
+    )
+    size = observation_size(config)
+    assert memory_needed(config) == {
+        "algorithm.buffer_world_steps": 2 * 1000 * 3 * (2 * size + 5) * 4,
+        # a transition, what the three critics see of it (3 x 3 x (size + 2)), two hidden layers of 64 of three pursuers
+        "algorithm.batch_size": 10 * 4 * (3 * (2 * size + 5) + 9 * (size + 2) + 3 * 128),
+        # actors size-64-64-2, a shared critic 3 (size + 2)-64-64-3; weight, target, gradient and two moments
+        "algorithm.net_arch": 20
+        * (
+            3 * ((size + 1) * 64 + 65 * 64 + 65 * 2)
+            + (3 * (size + 2) + 1) * 64 + 65 * 64 + 65 * 3
+        ),
+        # owner (1) and nearness (8) of 72 directions, before and after a step, under two rules; observations
+        "training.n_worlds": 5 * (4 * 9 * 72 + 8 * 3 * size),
+    }  # fmt: skip
+
+
+def test_the_buffer_of_a_training_is_what_was_counted() -> None:
+    config = tiny()
+    with_buffer = build_model(config, build_vec_env(config, 4), 0).replay_buffer
+    assert with_buffer is not None
+    arrays = [getattr(with_buffer, name) for name in REPLAY]
+    assert 2 * sum(array.nbytes for array in arrays) == memory_needed(config)["algorithm.buffer_world_steps"]
+
+
+@pytest.mark.parametrize(
+    ("key", "override"),
+    [
+        ("algorithm.buffer_world_steps", "training.world_steps=10000000000"),
+        ("training.n_worlds", "training.n_worlds=65536"),
+        ("algorithm.batch_size", "algorithm.batch_size=1048576"),
+    ],
+)
+def test_the_key_that_asks_for_most_is_named_with_the_figures(key: str, override: str) -> None:
+    overrides = ["algorithm.buffer_world_steps=10000000000", "training.world_steps=6000", override]
+    config = load_config(overrides=overrides, fields={"n_directions": 4096})
+    needed = memory_needed(config)
+    total = sum(needed.values())
+    check_memory(needed, available=total)
+    with pytest.raises(ConfigError) as caught:
+        check_memory(needed, available=total - 1)
+    figures = [f"{size / 1e9:.1f} GB" for size in (needed[key], total, total - 1)]
+    assert str(caught.value) == (
+        f"{key}: needs {figures[0]} of memory, of {figures[1]} in all, but this machine has {figures[2]}"
+    )
+
+
+@pytest.mark.parametrize(("text", "limit"), [("5000000\n", 5_000_000), ("max\n", None), ("9" * 30, None), ("", None)])
+def test_a_containers_memory_is_its_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, limit: int | None
+) -> None:
+    monkeypatch.setattr(trainable, "CONTAINER_LIMIT", tmp_path / "memory.max")
+    machine = available_memory()
+    assert machine > 1e8
+    (tmp_path / "memory.max").write_text(text)
+    assert available_memory() == (machine if limit is None else limit)
