@@ -11,14 +11,16 @@ from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import Episode
+from marl_encircle.experiments.records import Episode, Setting
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 WORLDS_AT_ONCE = 100
 """Always so many, the last ones for nothing if need be: the rounding of matrix products depends on the batch size."""
 
 
-def play_rounds(policy: MADDPGPolicy, config: Config, episodes: int, seed: int) -> list[Episode]:
+def play_rounds(
+    policy: MADDPGPolicy, config: Config, episodes: int, seed: int, setting: Setting | None = None
+) -> list[Episode]:
     """Play each round once, in a world of its own, with noise off and the scenario at its final difficulty.
 
     Round r of evaluation seed s starts from the same placement for every method. It is played until both closure rules
@@ -26,8 +28,10 @@ def play_rounds(policy: MADDPGPolicy, config: Config, episodes: int, seed: int) 
 
     :param episodes: number of rounds
     :param seed: evaluation seed; world r is seeded with ``world_seeds(seed, episodes)[r]``
+    :param setting: where to play; by default where the policy was trained
     """
-    scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
+    fields = {} if setting is None else setting._asdict()
+    scenario = replace(config.scenario, **fields, n_directions=config.evaluation.n_directions)
     reward = config.reward.build()
     rounds: list[Episode] = []
     seeds = world_seeds(seed, -(-episodes // WORLDS_AT_ONCE) * WORLDS_AT_ONCE)

@@ -1,13 +1,16 @@
 """A grid file -> the runs it asks for: methods x settings x seeds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
 
+from marl_encircle.core.scenes import SCENES
 from marl_encircle.experiments.config import (
     Config,
     Profile,
@@ -20,6 +23,7 @@ from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.trainable import check_seed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
+from marl_encircle.spelling import nearest
 
 
 class SettingConfig(Section):
@@ -48,9 +52,17 @@ class Shared(Section):
     obstacles: int
 
 
+class Elsewhere(Section):
+    """Trained policies are played in another scene too: those of all settings with so many obstacles."""
+
+    scene: str
+    obstacles: int
+
+
 class GridConfig(Section):
     """A grid file.
 
+    :param elsewhere: scenes that no run was trained in
     :param frozen: the commit in which scenario and recipe were frozen, 40 hexadecimal digits; the tables name it
     """
 
@@ -59,6 +71,7 @@ class GridConfig(Section):
     frozen: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
     groups: Annotated[list[Group], Field(min_length=1)]
     shared: list[Shared]
+    elsewhere: Annotated[list[Elsewhere], Field(default_factory=list)]
 
 
 class Job(NamedTuple):
@@ -92,11 +105,17 @@ def _config(job: Job) -> Config:
 
 
 class Grid(NamedTuple):
-    """The runs of a grid, the cells that share another's runs, and the commit in which its recipe was frozen."""
+    """The runs of a grid and what is made of them.
+
+    :param aliases: cell -> the cell whose runs it shares
+    :param frozen: the commit in which scenario and recipe were frozen
+    :param elsewhere: setting of a training -> other settings in which its policies are played too
+    """
 
     jobs: tuple[Job, ...]
     aliases: dict[Cell, Cell]
     frozen: str | None = None
+    elsewhere: Mapping[Setting, tuple[Setting, ...]] = MappingProxyType({})
 
     @property
     def cells(self) -> set[Cell]:
@@ -145,7 +164,10 @@ def load_grid(name: str) -> Grid:
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
-    return Grid(tuple(sorted(jobs, key=lambda job: job.seed)), aliases, grid.frozen)
+    in_order = tuple(sorted(jobs, key=lambda job: job.seed))
+    with naming_file(path):
+        elsewhere = _elsewhere(in_order, grid.elsewhere)
+    return Grid(in_order, aliases, grid.frozen, elsewhere)
 
 
 @contextmanager
@@ -172,6 +194,28 @@ def _check_same(earlier: Job, later: Job) -> None:
             f"{method} at {where} is asked for with two configurations: {lines[0]}; the method of one of them needs "
             "another name"
         )
+
+
+def _elsewhere(jobs: Iterable[Job], entries: Iterable[Elsewhere]) -> dict[Setting, tuple[Setting, ...]]:
+    """Return the settings in which the policies of each setting are played too.
+
+    :raises ConfigError: for a scene that there is not, or whose obstacles the policies cannot observe
+    """
+    jobs = list(jobs)
+    trained = {job.setting for job in jobs}
+    played: dict[Setting, tuple[Setting, ...]] = {}
+    for i, entry in enumerate(entries):
+        if entry.scene not in SCENES:
+            raise ConfigError(f"elsewhere.{i}.scene: unknown scene {entry.scene!r:.80}{nearest(entry.scene, SCENES)}")
+        for job in jobs:
+            other = job.setting._replace(scene=entry.scene)
+            if job.setting.obstacles != entry.obstacles or other in (*trained, *played.get(job.setting, ())):
+                continue
+            scenario = job.config.scenario
+            if replace(scenario, scene=entry.scene).units != scenario.units:
+                raise ConfigError(f"elsewhere.{i}.scene: needs composite_unit, or an obstacle there is several here")
+            played[job.setting] = (*played.get(job.setting, ()), other)
+    return played
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

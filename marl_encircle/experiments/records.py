@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast, get_type_hints
 
@@ -85,6 +85,7 @@ class Run:
     :param status: what became of it; only a finished one has rounds
     :param closure: the method's own closure rule; None for an unfinished run
     :param episodes: its evaluation rounds
+    :param elsewhere: rounds of its policy in settings that it was not trained in
     """
 
     cell: Cell
@@ -92,6 +93,7 @@ class Run:
     status: Status
     closure: Closure | None = None
     episodes: Sequence[Episode] = ()
+    elsewhere: Mapping[Setting, Sequence[Episode]] = field(default_factory=dict)
 
 
 def episodes_to_csv(episodes: Sequence[Episode]) -> str:
@@ -160,8 +162,18 @@ def _cell(cell: str, kind: object, where: str) -> int | float | None:
 
 def run_path(cell: Cell, seed: int) -> Path:
     """Where a run lies in the folder of all runs: ``<method>/ratio<lambda>_n<n>_m<m>_<scene>/seed<s>``."""
-    ratio, pursuers, obstacles, scene = cell.setting
-    return Path(cell.method, f"ratio{float(ratio)!r}_n{pursuers}_m{obstacles}_{scene}", f"seed{seed}")
+    return Path(cell.method, setting_name(cell.setting), f"seed{seed}")
+
+
+def setting_name(setting: Setting) -> str:
+    """How folders and files spell a setting: ``ratio<lambda>_n<n>_m<m>_<scene>``."""
+    ratio, pursuers, obstacles, scene = setting
+    return f"ratio{float(ratio)!r}_n{pursuers}_m{obstacles}_{scene}"
+
+
+def episodes_name(setting: Setting | None = None) -> str:
+    """File of the rounds in a setting that the run was not trained in; by default of those in its own."""
+    return "episodes.csv" if setting is None else f"episodes_{setting_name(setting)}.csv"
 
 
 def read_runs(folder: str | Path) -> list[Run]:
@@ -187,14 +199,21 @@ def _subfolders(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
 
 
-def read_setting(folder: Path) -> Setting:
-    """Return what a folder's name says; another spelling of its numbers would be a second folder of one cell."""
-    match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", folder.name)
-    if match is None:
-        raise files.DamagedFileError(folder, "a setting's folder must be named ratio<lambda>_n<n>_m<m>_<scene>")
-    setting = Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
-    _check_spelling(folder, run_path(Cell("", setting), 0).parent.name)
+def read_setting(path: Path) -> Setting:
+    """Return what the name of a folder says; another spelling of its numbers would be a second folder of one cell.
+
+    :raises files.DamagedFileError: for another name
+    """
+    setting = _setting_of(path.name)
+    if setting is None:
+        raise files.DamagedFileError(path, "a setting's folder must be named ratio<lambda>_n<n>_m<m>_<scene>")
+    _check_spelling(path, setting_name(setting))
     return setting
+
+
+def _setting_of(name: str) -> Setting | None:
+    match = re.fullmatch(r"ratio(\d+(?:\.\d+)?)_n(\d+)_m(\d+)_(\w+)", name)
+    return match and Setting(float(match[1]), int(match[2]), int(match[3]), match[4])
 
 
 def _seed(folder: Path) -> int:
@@ -225,15 +244,27 @@ def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
         if (folder / "episodes.csv").exists():
             raise files.DamagedFileError(folder / "episodes.csv", "its hash is not in run.json")
         return Run(cell, seed, "not evaluated", closure)
+    asked = record["config"]["evaluation"]
+    episodes = _episodes_of(folder / "episodes.csv", contents, asked)
+    elsewhere = {}
+    for name in contents:
+        setting = _setting_of(name.removeprefix("episodes_").removesuffix(".csv"))
+        if setting is not None and name == episodes_name(setting):
+            elsewhere[setting] = _episodes_of(folder / name, contents, asked)
+    return Run(cell, seed, "finished", closure, episodes, elsewhere)
+
+
+def _episodes_of(path: Path, contents: Mapping[str, bytes], asked: Mapping[str, int]) -> tuple[Episode, ...]:
+    """Return the rounds of a file, which must be those that the run's evaluation section asks for."""
     try:
-        episodes = episodes_from_csv(contents["episodes.csv"].decode("utf-8"))
+        episodes = episodes_from_csv(contents[path.name].decode("utf-8"))
     except ValueError as error:
-        raise files.DamagedFileError(folder / "episodes.csv", str(error)) from error
-    asked, seed_of_rounds = record["config"]["evaluation"]["episodes"], record["config"]["evaluation"]["seed"]
-    if not _are_rounds(episodes, asked, seed_of_rounds):
-        reason = f"its {len(episodes)} rounds are not rounds 0 to {asked - 1} of evaluation seed {seed_of_rounds}"
-        raise files.DamagedFileError(folder / "episodes.csv", f"{reason}, which the run's configuration asks for")
-    return Run(cell, seed, "finished", closure, tuple(episodes))
+        raise files.DamagedFileError(path, str(error)) from error
+    n, seed = asked["episodes"], asked["seed"]
+    if not _are_rounds(episodes, n, seed):
+        reason = f"its {len(episodes)} rounds are not rounds 0 to {n - 1} of evaluation seed {seed}"
+        raise files.DamagedFileError(path, f"{reason}, which the run's configuration asks for")
+    return tuple(episodes)
 
 
 def _are_rounds(episodes: Sequence[Episode], n: int, seed: int) -> bool:

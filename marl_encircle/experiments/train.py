@@ -38,7 +38,15 @@ from marl_encircle.experiments.callbacks import (
 from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
-from marl_encircle.experiments.records import Episode, config_hash, episodes_to_csv, read_record, run_path
+from marl_encircle.experiments.records import (
+    Episode,
+    Setting,
+    config_hash,
+    episodes_name,
+    episodes_to_csv,
+    read_record,
+    run_path,
+)
 from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
 from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -215,12 +223,15 @@ class _Run:
         (self.folder / checkpoint.NAME).unlink(missing_ok=True)
 
 
-def write_episodes(folder: Path, episodes: list[Episode]) -> None:
-    """Replace the evaluation rounds of a finished run and their hash in its record."""
-    data = episodes_to_csv(episodes).encode()
+def write_episodes(folder: Path, episodes: list[Episode], setting: Setting | None = None) -> None:
+    """Write evaluation rounds of a finished run and their hash into its record; former ones are replaced.
+
+    :param setting: where the rounds were played; by default where the run was trained
+    """
+    name, data = episodes_name(setting), episodes_to_csv(episodes).encode()
     record = read_record(folder)
-    record["sha256"] = dict(sorted({**record["sha256"], "episodes.csv": files.sha256_bytes(data)}.items()))
-    files.write_bytes(folder / "episodes.csv", data)
+    record["sha256"] = dict(sorted({**record["sha256"], name: files.sha256_bytes(data)}.items()))
+    files.write_bytes(folder / name, data)
     files.write_json(folder / "run.json", record)
 
 

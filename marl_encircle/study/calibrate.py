@@ -93,10 +93,7 @@ def load_protocol(name: str) -> Protocol:
     :raises ConfigError: naming file and key
     """
     path = find_file(name, "protocol")
-    try:
-        protocol = Protocol(**read_yaml(path))
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, Protocol))) from error
+    protocol = _read(path)
     scenarios = 1 + len(protocol.neighbours) + protocol.combinations
     if scenarios > MAX_SCENARIOS:
         raise ConfigError(f"{path}: {scenarios} scenarios; at most {MAX_SCENARIOS} may be tried")
@@ -106,6 +103,18 @@ def load_protocol(name: str) -> Protocol:
     with naming_file(path):
         _check_distinct(protocol)
     return protocol
+
+
+def calibrated_cells() -> list[Cell]:
+    """Return the cells of the paper by which the study's scenario was chosen."""
+    return _read(find_file("calibration", "protocol")).cells
+
+
+def _read(path: Path) -> Protocol:
+    try:
+        return Protocol(**read_yaml(path))
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, Protocol))) from error
 
 
 def _check_distinct(protocol: Protocol) -> None:

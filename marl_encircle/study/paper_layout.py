@@ -112,10 +112,16 @@ def seeds_of(result: Result) -> str:
     return ", ".join(parts)
 
 
-def notes_on(results: Iterable[Result], paper: Mapping[Cell, PaperResult]) -> list[Text]:
-    """Return the notes that such a table needs whatever its closure rule: on the numbers, and on the signs it has."""
-    results = list(results)
-    notes: list[Text] = [_LENGTH_NOTE, _INTERVAL_NOTE, _BEST_NOTE]
+def notes_on(
+    results: Iterable[Result], paper: Mapping[Cell, PaperResult] | None = None, *, columns_compete: bool = False
+) -> list[Text]:
+    """Return the notes that such a table needs whatever its closure rule: on the numbers, and on the signs it has.
+
+    :param paper: what the paper reports, where the table shows it
+    :param columns_compete: whether the best of a column is bold
+    """
+    results, paper = list(results), paper or {}
+    notes: list[Text] = [_LENGTH_NOTE, _INTERVAL_NOTE, *([_BEST_NOTE] if columns_compete else [])]
     if any(result.impossible for result in results):
         notes.append(_IMPOSSIBLE_NOTE)
     if any(reported.success_percent is None for reported in paper.values()):

@@ -11,12 +11,14 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid, load_grid
 from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.records import episodes_name
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
-from marl_encircle.study.calibrate import load_protocol
+from marl_encircle.study.calibrate import calibrated_cells
 from marl_encircle.study.cells import gather
 from marl_encircle.study.paper import reported_cells
+from marl_encircle.study.scenes import SCENE_TABLES, render_scenes
 from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, frozen_note, render_table1, render_tables
 
 TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
@@ -51,12 +53,15 @@ def reproduce(
     evaluated = 0
     for job in grid.jobs:
         folder = run_folder(job.config, job.seed, runs)
-        if (folder / "run.json").exists() and not (folder / "episodes.csv").exists():
+        settings = (None, *grid.elsewhere.get(job.setting, ()))
+        missing = [setting for setting in settings if not (folder / episodes_name(setting)).exists()]
+        if (folder / "run.json").exists() and missing:
             policy, config, record = load_run(folder)
             if record["status"] == "finished":
                 e = config.evaluation
-                write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed))
-                evaluated += 1
+                for setting in missing:
+                    write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed, setting), setting)
+                evaluated += missing[0] is None
     write_tables(grid, results)
     trained = progress.done + progress.diverged - progress.reused
     return Reproduction(trained, evaluated, progress.reused - evaluated, progress)
@@ -70,7 +75,7 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
     :raises DamagedFileError: if a run there is not what its record says
     """
     texts = render(grid, results)
-    for name in (*OTHER_TABLES, *AGREEMENT_TABLES):
+    for name in (*OTHER_TABLES, *SCENE_TABLES, *AGREEMENT_TABLES):
         if f"tables/{name}" not in texts:
             (Path(results) / "tables" / name).unlink(missing_ok=True)
     for name, text in texts.items():
@@ -87,9 +92,10 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
     runs = runs_of(grid, Path(results) / "runs")
     texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
+    texts |= render_scenes(runs, grid.elsewhere, grid.frozen)
     if grid.frozen:
-        calibrated = load_protocol("calibration").cells
-        texts |= render_agreement(gather(runs, grid.aliases), reported_cells(), calibrated, frozen_note(grid.frozen))
+        by_cell = gather(runs, grid.aliases)
+        texts |= render_agreement(by_cell, reported_cells(), calibrated_cells(), frozen_note(grid.frozen))
     return {f"tables/{name}": text for name, text in texts.items()}
 
 

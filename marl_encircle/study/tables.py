@@ -84,13 +84,13 @@ def render_tables(
     for name, paper in reported.items():
         results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
         rendered |= _texts(_main_table(name, results, paper, note))
-        rendered[f"{name}.csv"] = to_csv([_record(result, paper.get(result.cell)) for result in results])
+        rendered[f"{name}.csv"] = to_csv([record_of(result, paper.get(result.cell)) for result in results])
     rendered |= _common_table(cells, by_cell, reported, note)
     if others:
         results = [result_of(cell, by_cell[cell]) for cell in others]
         other = _other_table(results, note)
         rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
-        rendered["table_other.csv"] = to_csv([_record(result, None) for result in results])
+        rendered["table_other.csv"] = to_csv([record_of(result, None) for result in results])
     return rendered | render_differences(cells, by_cell, note)
 
 
@@ -166,7 +166,7 @@ def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, Paper
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
     header, rows, seeds = wide(layout, results, paper)
-    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper), *seeds, *note]
+    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *seeds, *note]
     return Table(name, layout.title, header, rows, notes)
 
 
@@ -178,7 +178,7 @@ def _common_table(
 ) -> dict[str, str]:
     """All cells of Tables 2-4 under the common closure rule."""
     results = [result_of(cell, runs.get(cell), "all") for cell in cells]
-    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, {}), *note]
+    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, columns_compete=True), *note]
     sections = [f"# {_COMMON}\n\n" + "".join(f"- {note}\n" for note in notes)]
     for name, paper in reported.items():
         settings = {cell.setting for cell in paper}
@@ -188,7 +188,7 @@ def _common_table(
     every = reported_cells()
     return {
         "table_common_rule.md": "\n".join(sections),
-        "table_common_rule.csv": to_csv([_record(result, every.get(result.cell)) for result in results]),
+        "table_common_rule.csv": to_csv([record_of(result, every.get(result.cell)) for result in results]),
     }
 
 
@@ -204,7 +204,7 @@ def _other_table(results: Sequence[Result], note: Sequence[str]) -> Table:
         ]
         for result in results
     ]
-    notes = [_OWN_RULE_NOTE, *notes_on(results, {}), *note]
+    notes = [_OWN_RULE_NOTE, *notes_on(results), *note]
     return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
 
 
@@ -213,7 +213,7 @@ def _owner(result: Result) -> str | None:
     return result.runs.runs_of if result.runs else None
 
 
-def _record(result: Result, paper: PaperResult | None) -> dict[str, str]:
+def record_of(result: Result, paper: PaperResult | None) -> dict[str, str]:
     """Write a cell in CSV: empty where there is nothing."""
     summary, runs = result.summary, result.runs
     # sigma_c is recorded under the method's own rule, up to its own success: the other rule has none.

@@ -16,7 +16,7 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.metrics import wilson_interval
 from marl_encircle.experiments.provenance import cpu_model
-from marl_encircle.experiments.records import Cell, Episode, episodes_from_csv
+from marl_encircle.experiments.records import Cell, Episode, Setting, episodes_from_csv, episodes_name
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study.reproduce import render
 
@@ -58,20 +58,24 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     folders = [folder for folder in folders if (folder / "episodes.csv").exists()]
     rounds = equal = 0
     exact = True
-    successes: dict[Cell, list[tuple[bool, bool]]] = defaultdict(list)
+    successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)
     for done, folder in enumerate(folders, start=1):
         policy, config, record = load_run(folder)
-        recorded = episodes_from_csv((folder / "episodes.csv").read_text(encoding="utf-8"))
-        played = play_rounds(policy, config, len(recorded), config.evaluation.seed)
         same_processor = record["cpu"] == cpu_model()
         exact &= same_processor
-        rounds += len(recorded)
-        equal += count_equal(recorded, played, same_processor)
         closure = config.reward.closure
-        successes[config.cell] += [
-            (then.success_step(closure) is not None, now.success_step(closure) is not None)
-            for then, now in zip(recorded, played, strict=True)
-        ]
+        for setting in (None, *grid.elsewhere.get(config.cell.setting, ())):
+            path = folder / episodes_name(setting)
+            if not path.exists():
+                continue
+            recorded = episodes_from_csv(path.read_text(encoding="utf-8"))
+            played = play_rounds(policy, config, len(recorded), config.evaluation.seed, setting)
+            rounds += len(recorded)
+            equal += count_equal(recorded, played, same_processor)
+            successes[config.cell, setting] += [
+                (then.success_step(closure) is not None, now.success_step(closure) is not None)
+                for then, now in zip(recorded, played, strict=True)
+            ]
         if report is not None:
             report(done, len(folders))
     off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())

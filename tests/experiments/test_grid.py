@@ -75,6 +75,28 @@ def test_a_grid_may_name_the_commit_in_which_its_recipe_was_frozen(tmp_path: Pat
     assert grid_of(tmp_path, f"frozen: {COMMIT}\n" + GRID.format(method="ours")).frozen == COMMIT
 
 
+def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> None:
+    text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: 1}, {scene: tunnel, obstacles: 2}]\n"
+    assert grid_of(tmp_path, text).elsewhere == {ONE: (ONE._replace(scene="concave"),)}
+    study = load_grid("all").elsewhere
+    assert {setting.obstacles for setting in study} == {1}
+    assert {len(others) for others in study.values()} == {2}
+
+
+def test_a_scene_in_which_a_policy_was_trained_is_not_elsewhere(tmp_path: Path) -> None:
+    text = GRID.format(method="ours") + "elsewhere: [{scene: random, obstacles: 1}]\n"
+    assert grid_of(tmp_path, text).elsewhere == {}
+
+
+def test_a_scene_in_which_no_policy_can_play_is_refused(tmp_path: Path) -> None:
+    text = GRID.format(method="ours")
+    with pytest.raises(ConfigError, match=r"elsewhere\.0\.scene: unknown scene 'tunel'; did you mean tunnel"):
+        grid_of(tmp_path, text + "elsewhere: [{scene: tunel, obstacles: 1}]\n")
+    (tmp_path / "split.yaml").write_text("composite_unit: false\n")
+    with pytest.raises(ConfigError, match=r"elsewhere\.0\.scene: needs composite_unit"):
+        grid_of(tmp_path, "scenario: split.yaml\n" + text + "elsewhere: [{scene: tunnel, obstacles: 1}]\n")
+
+
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
     grid = load_grid("committed")
     assert len(grid.cells) == 9

@@ -11,6 +11,7 @@ from marl_encircle import files
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments import records
 from marl_encircle.experiments.records import Cell, Episode, Run, Setting, config_hash
+from marl_encircle.experiments.train import write_episodes
 
 CELL = Cell("ours", Setting(1.1, 3, 1))
 KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
@@ -76,6 +77,18 @@ def test_a_run_comes_back_from_its_folder(tmp_path: Path) -> None:
         Run(CELL, 10, "finished", "all", episodes),
     ]
     assert (tmp_path / "model_a" / "ratio1.25_n2_m0_tunnel" / "seed0" / "run.json").exists()
+
+
+def test_rounds_elsewhere_belong_to_the_run_and_are_checked_like_its_own(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, CELL, 0, (episode(0, 10), episode(1, None)))
+    tunnel = CELL.setting._replace(scene="tunnel")
+    write_episodes(folder, [episode(0, 30), episode(1, 40)], tunnel)
+    [run] = records.read_runs(tmp_path)
+    assert run.elsewhere == {tunnel: (episode(0, 30), episode(1, 40))}
+    assert run.episodes == (episode(0, 10), episode(1, None))
+    write_episodes(folder, [episode(0, 30)], tunnel)
+    with pytest.raises(files.DamagedFileError, match=r"tunnel\.csv.*its 1 rounds are not rounds 0 to 1"):
+        records.read_runs(tmp_path)
 
 
 def test_no_folder_has_no_runs(tmp_path: Path) -> None:

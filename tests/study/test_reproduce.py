@@ -5,23 +5,35 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_runs import TINY, train_in_this_process
+from tiny_runs import TINY, everything_in, train_in_this_process
 
 from marl_encircle import files
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import load_grid
-from marl_encircle.experiments.records import config_hash
+from marl_encircle.experiments.records import Setting, config_hash, read_runs
 from marl_encircle.experiments.train import run_folder, train
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import reproduce as reproduction
 from marl_encircle.study.reproduce import TABLE1_METHODS, Reproduction, options_of, reproduce, write_tables
 from marl_encircle.study.tables import MethodOptions, render_table1
+from marl_encircle.study.verify import verify
 
 TABLES = sorted(
     [f"table{number}.{kind}" for number in (1, 2, 3, 4) for kind in ("csv", "md", "tex")]
     + [f"table_{name}.{kind}" for name in ("common_rule", "differences") for kind in ("csv", "md")]
 )
+
+
+ELSEWHERE = """\
+profile: smoke
+groups:
+  - methods: [ours]
+    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]
+    seeds: [0]
+shared: []
+elsewhere: [{scene: tunnel, obstacles: 1}]
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -71,6 +83,32 @@ def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) ->
     assert counts(reproduce("smoke", tmp_path, 1)) == (1, 0, 1)
     assert (first / "episodes.csv").read_bytes() == rounds
     assert tables(tmp_path) == before
+
+
+def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
+    grid = tmp_path / "grid.yaml"
+    grid.write_text(ELSEWHERE)
+    assert counts(reproduce(str(grid), tmp_path, 1)) == (1, 0, 0)
+    [run] = read_runs(tmp_path / "runs")
+    [(setting, rounds)] = run.elsewhere.items()
+    assert setting == Setting(1.1, 3, 1, "tunnel")
+    assert [(then.round, then.seed) for then in rounds] == [(now.round, now.seed) for now in run.episodes]
+    assert rounds != run.episodes
+    before = everything_in(tmp_path)
+    assert "tables/table_scenes.md" in before
+    assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
+    assert verify(load_grid(str(grid)), tmp_path).rounds == 2 * len(run.episodes)
+
+    [path] = tmp_path.rglob("episodes_*.csv")
+    rows = path.read_bytes()
+    path.unlink()
+    reproduce(str(grid), tmp_path, 1)
+    assert path.read_bytes() == rows
+    assert everything_in(tmp_path) == before
+
+    grid.write_text(ELSEWHERE.replace("tunnel", "random"))
+    write_tables(load_grid(str(grid)), tmp_path)
+    assert not (tmp_path / "tables" / "table_scenes.md").exists()
 
 
 def test_an_edited_row_is_found(tmp_path: Path) -> None:

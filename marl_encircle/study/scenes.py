@@ -1,0 +1,55 @@
+"""What the policies are worth in scenes that they were never trained in."""
+
+from collections.abc import Iterable, Mapping
+
+from marl_encircle.experiments.records import Cell, Run, Setting
+from marl_encircle.study.cells import gather, result_of
+from marl_encircle.study.paper import label, rank
+from marl_encircle.study.paper_layout import notes_on, success_and_length
+from marl_encircle.study.tables import frozen_note, record_of
+from marl_encircle.study.typeset import Text, markdown, to_csv
+
+SCENE_TABLES = ("table_scenes.md", "table_scenes.csv")
+
+_TITLE = "Scenes that no policy was trained in"
+_NOTES: list[Text] = [
+    "Cells: S [95 % interval] / MEL of the same policies in each scene; they were trained in the first one.",
+    "A policy sees where an obstacle's centre is, not its shape.",
+]
+
+
+def render_scenes(
+    runs: Iterable[Run], elsewhere: Mapping[Setting, Iterable[Setting]], frozen: str | None = None
+) -> dict[str, str]:
+    """Return ``table_scenes.md`` and ``.csv`` -> text; nothing where no policy was played in another scene.
+
+    :param runs: those that were played in no other scene are passed over
+    :param elsewhere: setting of a training -> other settings to show
+    :param frozen: commit in which scenario and recipe were frozen, for a note
+    """
+    played: list[Run] = []
+    for run in runs:
+        others = [other for other in elsewhere.get(run.cell.setting, ()) if other in run.elsewhere]
+        if others:
+            played += [run, *(_as_run(run, other) for other in others)]
+    if not played:
+        return {}
+    results = {cell: result_of(cell, found) for cell, found in gather(played, {}).items()}
+    trained = {run.cell for run in played if run.elsewhere}
+    scenes = dict.fromkeys(run.cell.setting.scene for run in played)
+    rows: list[list[Text]] = []
+    for method, setting in sorted(trained, key=lambda cell: (rank(cell.method), cell)):
+        cells = [Cell(method, setting._replace(scene=scene)) for scene in scenes]
+        shown = [success_and_length(results[cell]) if cell in results else "" for cell in cells]
+        rows.append([label(method), *(f"{value:g}" for value in setting[:3]), *shown])
+    notes = [*_NOTES, *notes_on(results.values()), *frozen_note(frozen)]
+    texts = (
+        markdown(_TITLE, ["Method", "λ", "n", "m", *scenes], rows, notes),
+        to_csv([record_of(result, None) for result in results.values()]),
+    )
+    return dict(zip(SCENE_TABLES, texts, strict=True))
+
+
+def _as_run(run: Run, setting: Setting) -> Run:
+    """Return the rounds that a run's policy played in another setting as those of a run of that setting."""
+    return Run(Cell(run.cell.method, setting), run.seed, run.status, run.closure, run.elsewhere[setting])
