@@ -16,6 +16,7 @@ from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
 from marl_encircle.study.calibrate import calibrated_cells
+from marl_encircle.study.cards import render_cards
 from marl_encircle.study.cells import gather
 from marl_encircle.study.paper import reported_cells
 from marl_encircle.study.scenes import SCENE_TABLES, render_scenes
@@ -68,7 +69,7 @@ def reproduce(
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:
-    """Render the tables from the runs of a grid; a former table that it does not have goes.
+    """Write the tables and the policies' cards from the runs of a grid; a former table that it does not have goes.
 
     :return: the files written
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
@@ -84,19 +85,23 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
 
 
 def render(grid: Grid, results: str | Path) -> dict[str, str]:
-    """Return the tables of a grid: path below ``results`` -> text. Nothing is written.
+    """Return the tables of a grid and the cards of its first policies: path below ``results`` -> text.
+
+    Nothing is written.
 
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
-    runs = runs_of(grid, Path(results) / "runs")
+    folder = Path(results) / "runs"
+    runs = runs_of(grid, folder)
     texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
     texts |= render_scenes(runs, grid.elsewhere, grid.frozen)
     if grid.frozen:
         by_cell = gather(runs, grid.aliases)
         texts |= render_agreement(by_cell, reported_cells(), calibrated_cells(), frozen_note(grid.frozen))
-    return {f"tables/{name}": text for name, text in texts.items()}
+    cards = {f"runs/{name}": text for name, text in render_cards(grid, runs, folder).items()}
+    return {f"tables/{name}": text for name, text in texts.items()} | cards
 
 
 def options_of(method: str) -> MethodOptions:
