@@ -78,13 +78,15 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path, former: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path that becomes ``path`` when the block ends without an error.
 
     For libraries that insist on writing themselves. The temporary path has the suffix of ``path``, by which many choose
     the format.
 
     :param path: the file to be written; missing folders are made
+    :param former: name in the same folder that the old file, if there is one, takes. A process killed at the wrong
+        moment leaves the old file under this name and none under ``path``
     :raises OSError: with the file's name, also for errors of the block; the old file is unchanged
     """
     path = Path(path)
@@ -94,13 +96,31 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         _remove_leftovers(path)
         yield temporary
         _sync(temporary)
-        _replace(temporary, path)
+        if former is not None and path.exists():
+            _rotate(temporary, path, former)
+        else:
+            _replace(temporary, path)
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         raise OSError(error.errno or errno.EIO, f"not saved: {reason}", str(path)) from error
     finally:
         with suppress(OSError):  # the error under way says more than this one
             temporary.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file if there is one.
+
+    :raises OSError: with the file's name
+    """
+    if path.exists():  # on a file system that is read-only, removing nothing would be an error too
+        path.unlink(missing_ok=True)
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what killed processes of any host left in a folder, where nobody else writes now: under its lock."""
+    for path in folder.glob(f"{TEMPORARY_PREFIX}-*"):
+        path.unlink(missing_ok=True)
 
 
 def _temporary_stem() -> str:
@@ -155,6 +175,18 @@ def _replace(temporary: Path, path: Path) -> None:
                 reason = f"{second.strerror}; nor could the disk confirm the new content, which is in place"
                 raise OSError(second.errno, f"the former content cannot be put back: {reason}") from error
             raise
+
+
+def _rotate(temporary: Path, path: Path, former: Path) -> None:
+    """Give ``path`` the name ``former`` and ``temporary`` the name ``path``, for good or not at all."""
+    path.replace(former)
+    try:
+        temporary.replace(path)
+        _sync(path.parent)
+    except OSError:
+        with suppress(OSError):  # the old file is then still whole, under the other name
+            former.replace(path)
+        raise
 
 
 @contextmanager

@@ -1,8 +1,7 @@
-"""What happens beside a training: logs, the learning curve, the progress bar, checkpoints, and the end of it."""
+"""What happens beside a training: logs, the learning curve, the progress bar, checkpoints, and signals."""
 
 import csv
 import io
-import math
 import signal
 import time
 from collections import deque
@@ -24,6 +23,9 @@ from marl_encircle.experiments.metrics import summarise_run
 from marl_encircle.maddpg import MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
+CHECKPOINT_SHARE = 0.02
+SECONDS_BETWEEN_CHECKPOINTS = 60.0
+
 
 class Stopped(Exception):  # noqa: N818 - nothing is wrong
     """The training was asked to stop, and can go on from its checkpoint.
@@ -34,10 +36,6 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
     def __init__(self, signum: int) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name}; run the same command again to resume")
         self.signum = signum
-
-
-class Diverged(Exception):  # noqa: N818 - a result, not a fault of the program
-    """A loss or a weight is no finite number any more."""
 
 
 @contextmanager
@@ -170,45 +168,42 @@ class Checkpointer(BaseCallback):
     """Save everything from time to time and when a signal asks to stop; between two steps, where nothing is under way.
 
     :param save: writes the checkpoint
-    :param every: seconds between checkpoints
+    :param every: seconds between checkpoints; None: a minute or more, so that all of them together, the next included,
+        take at most ``CHECKPOINT_SHARE`` of the training's time
     :param caught: signals so far, see :func:`stop_signals`
+    :param clock: seconds since whenever
     """
 
-    def __init__(self, save: Callable[[], None], every: float, caught: list[int]) -> None:
+    def __init__(
+        self,
+        save: Callable[[], None],
+        every: float | None,
+        caught: list[int],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         super().__init__()
-        self.save, self.every, self.caught = save, every, caught
-        self._last = time.monotonic()
+        self.save, self.every, self.caught, self.clock = save, every, caught, clock
+        self._started = self._last = clock()
+        self._latest_cost = self._costs = 0.0
 
     def _on_rollout_start(self) -> None:
-        if self.caught or time.monotonic() - self._last >= self.every:
+        begun = self.clock()
+        if self.caught or self._is_due(begun):
             self.save()
-            self._last = time.monotonic()
+            self._last = self.clock()
+            self._latest_cost = self._last - begun
+            self._costs += self._latest_cost
         if self.caught:
             raise Stopped(self.caught[0])
 
-    def _on_step(self) -> bool:
-        return True
-
-
-class DivergenceGuard(BaseCallback):
-    """End the training when a loss or a weight of the actors is no finite number any more."""
-
-    model: MADDPG
-
-    def _on_rollout_start(self) -> None:
-        self.check()
+    def _is_due(self, now: float) -> bool:
+        if self.every is not None:
+            return now - self._last >= self.every
+        allowed = CHECKPOINT_SHARE * (now - self._started)
+        return now - self._last >= SECONDS_BETWEEN_CHECKPOINTS and self._costs + self._latest_cost <= allowed
 
     def _on_step(self) -> bool:
         return True
-
-    def check(self) -> None:
-        """Raise Diverged unless all is well."""
-        for name in ("train/critic_loss", "train/actor_loss"):
-            value = self.logger.name_to_value.get(name, 0.0)
-            if not math.isfinite(value):
-                raise Diverged(f"{name} is {value}")
-        if not all(bool(weights.isfinite().all()) for weights in self.model.actor.parameters()):
-            raise Diverged("the actors have weights that are not finite")
 
 
 class ProgressBar(BaseCallback):

@@ -2,11 +2,12 @@
 
 A checkpoint is a tree of dictionaries and lists with arrays and plain numbers in it. The arrays go into a safetensors
 file, the tree that refers to them and has their hashes into its metadata as JSON: no pickle, and one atomic write for
-all of it.
+all of it. A run folder keeps the two newest ones.
 """
 
 import hashlib
 import json
+import logging
 import random
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,19 +23,63 @@ from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.maddpg import MADDPG
 
 NAME = "checkpoint.safetensors"
+FORMER = "checkpoint.former.safetensors"
+DAMAGED = "checkpoint.damaged.safetensors"
 ARRAY = "$array"
 COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
+logger = logging.getLogger(__name__)
 
-def save_tree(path: Path, tree: Mapping[str, Any]) -> None:
+
+def save(folder: Path, tree: Mapping[str, Any]) -> None:
+    """Write the newest checkpoint of a run folder; the newest until now becomes the former one.
+
+    :param tree: see :func:`save_tree`
+    :raises OSError: with the file's name; the newest one is unchanged
+    """
+    save_tree(folder / NAME, tree, folder / FORMER)
+
+
+def load(folder: Path) -> dict[str, Any] | None:
+    """Return the newest whole checkpoint of a run folder, None if there is no checkpoint.
+
+    Where the newest is damaged or missing, a warning says so and the former one is taken; the damaged file is put aside
+    under another name, lest the next save take it for a former one.
+
+    :raises DamagedFileError: if there are checkpoints, none of which is whole
+    """
+    newest, former = folder / NAME, folder / FORMER
+    if not former.exists():
+        return load_tree(newest) if newest.exists() else None
+    try:
+        return load_tree(newest)
+    except files.DamagedFileError as error:
+        try:
+            tree = load_tree(former)
+        except files.DamagedFileError as other:
+            raise files.DamagedFileError(newest, f"{error.reason}; neither is the former one: {other}") from error
+        if newest.exists():
+            newest.replace(folder / DAMAGED)
+        logger.warning("%s; going on from the checkpoint before it, %s", error, former.name)
+        return tree
+
+
+def remove(folder: Path) -> None:
+    """Remove the checkpoints of a run folder, if there are any."""
+    for name in (FORMER, DAMAGED, NAME):
+        files.remove(folder / name)
+
+
+def save_tree(path: Path, tree: Mapping[str, Any], former: Path | None = None) -> None:
     """Write a tree as one file, atomically.
 
     :param tree: dictionaries with names as keys, lists, arrays, tensors, numbers, strings, None
+    :param former: name that the old file takes
     """
     arrays: dict[str, np.ndarray] = {}
     plain = _take_arrays(tree, "", arrays)
-    with files.atomic_path(path) as temporary:
+    with files.atomic_path(path, former) as temporary:
         text = json.dumps(plain)
         # One entry: safetensors writes several in an order that changes from call to call.
         checked = f"{files.sha256_bytes(text.encode())} {text}"
@@ -58,18 +103,21 @@ def load_tree(path: Path) -> dict[str, Any]:
     return restored
 
 
-def capture(model: MADDPG, curriculum: CurriculumVecEnv) -> dict[str, Any]:
-    """Return everything that the rest of the training depends on, between two vectorised steps."""
+def capture(model: MADDPG, curriculum: CurriculumVecEnv, *, with_replay: bool = True) -> dict[str, Any]:
+    """Return everything that the rest of the training depends on, between two vectorised steps.
+
+    :param with_replay: not needed when only the evaluation is left; it is nearly all of the size
+    """
     buffer = model.replay_buffer
     assert buffer is not None
-    filled = buffer.buffer_size if buffer.full else buffer.pos
+    filled = (buffer.buffer_size if buffer.full else buffer.pos) if with_replay else 0
     return {
         "parameters": model.get_parameters(),
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "last_obs": model._last_obs,
         "last_episode_starts": model._last_episode_starts,
         "replay": {name: getattr(buffer, name)[:filled] for name in REPLAY},
-        "replay_position": [buffer.pos, buffer.full],
+        "replay_position": [buffer.pos, buffer.full] if with_replay else [0, False],
         "worlds": _distinct(curriculum.venv.env_method("get_state")),
         "world_steps": curriculum.world_steps,
         "random": {
@@ -83,9 +131,7 @@ def capture(model: MADDPG, curriculum: CurriculumVecEnv) -> dict[str, Any]:
 
 def restore(model: MADDPG, curriculum: CurriculumVecEnv, saved: Mapping[str, Any]) -> None:
     """Put a freshly built model and its environment where :func:`capture` was called, bit for bit."""
-    model.set_parameters({name: _to_torch(value) for name, value in saved["parameters"].items()})
-    for name in COUNTERS:
-        setattr(model, name, saved["counters"][name])
+    restore_parameters(model, saved)
     model._last_obs = saved["last_obs"]
     model._last_episode_starts = saved["last_episode_starts"]
     buffer = model.replay_buffer
@@ -103,6 +149,13 @@ def restore(model: MADDPG, curriculum: CurriculumVecEnv, saved: Mapping[str, Any
     th.set_rng_state(th.from_numpy(rng["torch"]))
     version, internal, gauss = rng["python"]
     random.setstate((version, tuple(internal), gauss))
+
+
+def restore_parameters(model: MADDPG, saved: Mapping[str, Any]) -> None:
+    """Put weights, optimisers and counters back."""
+    model.set_parameters({name: to_torch(value) for name, value in saved["parameters"].items()})
+    for name in COUNTERS:
+        setattr(model, name, saved["counters"][name])
 
 
 def _distinct(states: list[Any]) -> list[Any]:
@@ -146,12 +199,12 @@ def _digest(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _to_torch(value: Any) -> Any:
+def to_torch(value: Any) -> Any:
     """Return a state dict of arrays as PyTorch wants it: tensors, and an optimiser's parameters by number."""
     if isinstance(value, np.ndarray):
         return th.from_numpy(value)
     if isinstance(value, list):
-        return [_to_torch(inner) for inner in value]
+        return [to_torch(inner) for inner in value]
     if isinstance(value, dict):
-        return {int(key) if key.isdigit() else key: _to_torch(inner) for key, inner in value.items()}
+        return {int(key) if key.isdigit() else key: to_torch(inner) for key, inner in value.items()}
     return value

@@ -33,11 +33,11 @@ class RayExecutor:
 
     :param address: HOST:PORT of a cluster; by default one is started on this machine, on loopback, and ends with the
         sweep
-    :param checkpoint_every: seconds between checkpoints
+    :param checkpoint_every: seconds between checkpoints, see :func:`marl_encircle.experiments.train.train`
     :raises ConfigError: if Ray is not installed, or the address is none
     """
 
-    def __init__(self, address: str | None = None, checkpoint_every: float = 120.0) -> None:
+    def __init__(self, address: str | None = None, checkpoint_every: float | None = None) -> None:
         if address is not None and not re.fullmatch(r"[^:/]+:[0-9]{1,5}", address):
             raise ConfigError(f"--address {address[:80]} is not HOST:PORT, such as 192.168.0.10:6379")
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -99,7 +99,7 @@ def _check_reachable(address: str) -> None:
 class _RayWorker:
     """A task, and those that follow it when its node dies."""
 
-    def __init__(self, ray: Any, job: Job, out: Path, checkpoint_every: float) -> None:
+    def __init__(self, ray: Any, job: Job, out: Path, checkpoint_every: float | None) -> None:
         self._ray, self._folder = ray, run_folder(job.config, job.seed, out)
         one_thread = {"env_vars": {"OMP_NUM_THREADS": "1"}}
         self._remote = ray.remote(num_cpus=1, max_retries=0, runtime_env=one_thread)(_train_on_node)
@@ -130,7 +130,7 @@ class _RayWorker:
         return True
 
 
-def _train_on_node(config: Config, seed: int, out: Path, checkpoint_every: float, sources: str) -> str | None:
+def _train_on_node(config: Config, seed: int, out: Path, checkpoint_every: float | None, sources: str) -> str | None:
     """Train one run on the node that this process runs on.
 
     :param sources: hash of the sweep's sources

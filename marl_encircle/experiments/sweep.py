@@ -12,8 +12,7 @@ from marl_encircle import locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import read_record
-from marl_encircle.experiments.train import check_same_run, run_folder
+from marl_encircle.experiments.train import ended_run, run_folder
 
 POLL_SECONDS = 0.2
 
@@ -161,14 +160,8 @@ def _running(job: Job, out: str | Path) -> Running:
 
 
 def _record_of(job: Job, out: str | Path) -> dict[str, Any] | None:
-    """Return the record of a job's finished run, if there is one and it is the job's."""
-    folder = run_folder(job.config, job.seed, out)
-    if not (folder / "run.json").exists():
-        return None
-    record = read_record(folder)
-    # Both engines train the same policy, so that a run of either will do.
-    check_same_run(folder, job.config, job.seed, record.get("engine", "native"))
-    return record
+    """Return the record of a job's run, if it has ended and is the job's."""
+    return ended_run(run_folder(job.config, job.seed, out), job.config, job.seed)
 
 
 def _count(record: dict[str, Any], progress: Progress) -> None:

@@ -5,6 +5,7 @@ actors), ``progress.csv`` (the learning curve) and ``episodes.csv`` (the evaluat
 machine and versions give equal files, save the times and versions in ``run.json``.
 """
 
+import logging
 import time
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 from marl_encircle import files, locks
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
-from marl_encircle.experiments import checkpoint
+from marl_encircle.experiments import checkpoint, divergence
 from marl_encircle.experiments.build import (
     Engine,
     build_model,
@@ -27,8 +28,6 @@ from marl_encircle.experiments.build import (
 )
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
-    Diverged,
-    DivergenceGuard,
     LearningCurve,
     ProgressBar,
     RoundLogger,
@@ -36,6 +35,7 @@ from marl_encircle.experiments.callbacks import (
     stop_signals,
 )
 from marl_encircle.experiments.config import Config, difference
+from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import (
@@ -54,6 +54,8 @@ from marl_encircle.experiments.yaml_files import ConfigError
 SCHEMA = 1
 ROUNDS_PER_LOG = 500
 
+logger = logging.getLogger(__name__)
+
 
 class OtherRunError(ConfigError):
     """The folder holds a run of another configuration."""
@@ -70,7 +72,7 @@ def train(
     engine: Engine = "native",
     out: str | Path = "results/runs",
     *,
-    checkpoint_every: float = 120.0,
+    checkpoint_every: float | None = None,
     progress_bar: bool = False,
     tensorboard: bool = False,
     draw: Draw | None = None,
@@ -80,7 +82,7 @@ def train(
     The last policy is the result. Uses one thread.
 
     :param out: folder of runs
-    :param checkpoint_every: seconds between checkpoints
+    :param checkpoint_every: seconds between checkpoints; by default chosen by the time that one takes
     :param tensorboard: write event files into the run folder
     :param draw: how rounds are drawn into them, for example by :mod:`marl_encircle.replays.thumbnails`
     :return: the run folder, and whether anything was left to do
@@ -92,8 +94,7 @@ def train(
     check_seed(config, seed)
     check_engine(engine)
     folder = run_folder(config, seed, out)
-    if (folder / "run.json").exists():
-        check_same_run(folder, config, seed, engine)
+    if ended_run(folder, config, seed, engine) is not None:
         return folder, False
     plan = _plan(config, seed, engine)
     check_training(config)
@@ -101,9 +102,9 @@ def train(
         check_tensorboard()
     _check_placement(config)
     with locks.folder_lock(folder):
-        if (folder / "run.json").exists():  # by whoever had the lock until now
-            check_same_run(folder, config, seed, engine)
+        if ended_run(folder, config, seed, engine) is not None:  # by whoever had the lock until now
             return folder, False
+        files.remove_temporary(folder)
         th.set_num_threads(1)
         _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard, draw)
     return folder, True
@@ -116,8 +117,7 @@ class _Run:
         self.config, self.folder, self.plan = config, folder, plan
         self.wall_seconds = self.cpu_seconds = 0.0
         self.rows: list[list[float | None]] = []
-        path = folder / checkpoint.NAME
-        saved = checkpoint.load_tree(path) if path.exists() else None
+        saved = checkpoint.load(folder)
         if saved is not None:
             _check_same(folder, plan, saved.get("plan", {}))
         self.env = build_vec_env(config, config.training.n_worlds, engine)
@@ -129,10 +129,11 @@ class _Run:
                 self.wall_seconds, self.cpu_seconds = saved["seconds"]
                 self.rows = saved["rows"]
             except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+                path = folder / checkpoint.NAME
                 raise files.DamagedFileError(path, f"does not fit this training: {str(error)[:200]}") from error
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def play(self, checkpoint_every: float, progress_bar: bool, tensorboard: bool, draw: Draw | None) -> None:
+    def play(self, checkpoint_every: float | None, progress_bar: bool, tensorboard: bool, draw: Draw | None) -> None:
         """Train to the end, then evaluate and record."""
         model, curriculum, total = self.model, self.curriculum, self.config.training.world_steps
         events = None
@@ -142,7 +143,7 @@ class _Run:
         model.set_logger(Logger(None, [events] if events else []))
         add_pictures = events.add_pictures if events else None
         curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows, add_pictures)
-        guard = DivergenceGuard()
+        guard = DivergenceGuard(self.plan, self.folder / divergence.NAME)
         callbacks: list[BaseCallback] = [RoundLogger(curriculum), guard, curve]
         bar = ProgressBar(curriculum, total)
         if progress_bar:
@@ -160,7 +161,8 @@ class _Run:
                 guard.check()
                 self.save_checkpoint()  # whatever stops what follows, the next start has only that to do
                 curve.add_point()
-            except Diverged:
+            except Diverged as error:
+                logger.warning("%s", error)
                 status = "diverged"
             finally:
                 bar.close()
@@ -171,13 +173,14 @@ class _Run:
 
     def save_checkpoint(self) -> None:
         """Write everything that the rest depends on."""
+        is_trained = self.curriculum.world_steps >= self.config.training.world_steps
         tree = {
             "plan": self.plan,
             "rows": self.rows,
             "seconds": self.seconds(),
-            "training": checkpoint.capture(self.model, self.curriculum),
+            "training": checkpoint.capture(self.model, self.curriculum, with_replay=not is_trained),
         }
-        checkpoint.save_tree(self.folder / checkpoint.NAME, tree)
+        checkpoint.save(self.folder, tree)
 
     def seconds(self) -> tuple[float, float]:
         """Wall-clock and processor seconds so far, those before a resume included."""
@@ -220,7 +223,8 @@ class _Run:
             "sha256": {name: files.sha256_bytes(data) for name, data in sorted(contents.items())},
         }
         files.write_json(self.folder / "run.json", record)
-        (self.folder / checkpoint.NAME).unlink(missing_ok=True)
+        if status == "finished":
+            checkpoint.remove(self.folder)
 
 
 def write_episodes(folder: Path, episodes: list[Episode], setting: Setting | None = None) -> None:
@@ -233,6 +237,23 @@ def write_episodes(folder: Path, episodes: list[Episode], setting: Setting | Non
     record["sha256"] = dict(sorted({**record["sha256"], name: files.sha256_bytes(data)}.items()))
     files.write_bytes(folder / name, data)
     files.write_json(folder / "run.json", record)
+
+
+def ended_run(folder: Path, config: Config, seed: int, engine: Engine | None = None) -> dict[str, Any] | None:
+    """Return the record of the run in ``folder``, None if there is none; checkpoints that it does not need any more go.
+
+    A process that was killed just after it had written the record has left them.
+
+    :param engine: None: either will do, since both train the same policy
+    :raises OtherRunError: if it is of another configuration, seed or engine
+    """
+    if not (folder / "run.json").exists():
+        return None
+    record = read_record(folder)
+    check_same_run(folder, config, seed, engine or record.get("engine", "native"))
+    if record["status"] == "finished":
+        checkpoint.remove(folder)
+    return record
 
 
 def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:

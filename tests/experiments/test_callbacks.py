@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -165,6 +166,27 @@ def test_checkpoints_come_at_their_interval_and_before_an_end() -> None:
         never.on_rollout_start()
     assert saved == [2, 2, 1]
     assert stopped.value.signum == signal.SIGTERM
+
+
+@pytest.mark.parametrize("cost", [0.01, 0.8, 5.0, 30.0])
+def test_checkpoints_take_less_than_three_in_a_hundred_of_the_time(cost: float) -> None:
+    now, spent, ends = 0.0, 0.0, [0.0]
+
+    def save() -> None:  # takes longer as the replay buffer fills, up to twice as long
+        nonlocal now, spent
+        seconds = cost * (1 + min(1, now / 400))
+        now, spent = now + seconds, spent + seconds
+        ends.append(now)
+
+    checkpointer = started(Checkpointer(save, None, [], lambda: now))
+    while now < 6 * 3600:
+        checkpointer.on_rollout_start()
+        now += 1.0
+        if len(ends) > 2 or now > 100 * cost:  # the first one has to show how long it takes
+            assert spent <= 0.03 * now
+    gaps = np.diff(ends)
+    assert gaps.min() >= 60
+    assert gaps[-1] <= max(62, 51 * 2 * cost), "seldom, but not more seldom than that"
 
 
 def test_a_training_that_cannot_save_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """A checkpoint gives back exactly what was put in, or says that it cannot."""
 
+import logging
 import random
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 import torch as th
 
 from marl_encircle import files
+from marl_encircle.experiments import checkpoint
 from marl_encircle.experiments.checkpoint import load_tree, save_tree
 
 
@@ -108,3 +110,57 @@ def test_what_cannot_be_saved_leaves_the_former_checkpoint(tmp_path: Path) -> No
         save_tree(path, {"a": object()})
     assert load_tree(path) == {"a": 1}
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+# the two newest
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_two_newest_are_kept(tmp_path: Path) -> None:
+    assert checkpoint.load(tmp_path) is None
+    for number in range(4):
+        checkpoint.save(tmp_path, {"number": number})
+        assert checkpoint.load(tmp_path) == {"number": number}
+    assert names(tmp_path) == sorted([checkpoint.NAME, checkpoint.FORMER])
+    assert load_tree(tmp_path / checkpoint.FORMER) == {"number": 2}
+    checkpoint.remove(tmp_path)
+    assert names(tmp_path) == []
+
+
+def test_where_the_newest_is_damaged_the_former_is_taken_and_said_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(2):
+        checkpoint.save(tmp_path, {"number": number})
+    newest = tmp_path / checkpoint.NAME
+    newest.write_bytes(newest.read_bytes()[:-1])
+    with caplog.at_level(logging.WARNING):
+        assert checkpoint.load(tmp_path) == {"number": 0}
+    (line,) = caplog.messages
+    assert line.startswith(f"{newest}: not a valid checkpoint: ")
+    assert line.endswith(f"; going on from the checkpoint before it, {checkpoint.FORMER}")
+    assert names(tmp_path) == sorted([checkpoint.DAMAGED, checkpoint.FORMER])
+    # the good one is kept until a better one is there
+    checkpoint.save(tmp_path, {"number": 5})
+    assert load_tree(tmp_path / checkpoint.FORMER) == {"number": 0}
+    assert checkpoint.load(tmp_path) == {"number": 5}
+    checkpoint.remove(tmp_path)
+    assert names(tmp_path) == []
+
+
+def test_a_process_killed_between_the_two_names_leaves_the_former(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, {"number": 0})
+    (tmp_path / checkpoint.NAME).replace(tmp_path / checkpoint.FORMER)
+    assert checkpoint.load(tmp_path) == {"number": 0}
+    assert names(tmp_path) == [checkpoint.FORMER]
+
+
+def test_where_both_are_damaged_both_are_named_and_kept(tmp_path: Path) -> None:
+    for name in (checkpoint.NAME, checkpoint.FORMER):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(files.DamagedFileError, match=rf"{checkpoint.NAME}: .*; neither is .*{checkpoint.FORMER}: not"):
+        checkpoint.load(tmp_path)
+    assert names(tmp_path) == sorted([checkpoint.NAME, checkpoint.FORMER])

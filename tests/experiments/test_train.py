@@ -461,7 +461,7 @@ def test_a_diverged_training_is_kept_and_shown(
     assert list(record) == KEYS
     assert record["status"] == "diverged"
     assert record["world_steps"] == 4 * (when + 1)
-    assert everything_in(folder) == ["policy.safetensors", "progress.csv", "run.json"]
+    assert everything_in(folder) == ["divergence.safetensors", "policy.safetensors", "progress.csv", "run.json"]
     assert record["sha256"] == {
         name: files.sha256_file(folder / name) for name in ("policy.safetensors", "progress.csv")
     }
