@@ -136,7 +136,7 @@ def train_slowly(out: Path, engine: Engine, checkpoint_every: float) -> None:
 def in_another_process(function: Callable[..., None], *arguments: object) -> BaseProcess:
     """Start a function in a process that has imported the package and done nothing else."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["marl_encircle.cli"])
+    context.set_forkserver_preload(["marl_encircle.cli", "marl_encircle.experiments.train"])
     process = context.Process(target=function, args=arguments)
     process.start()
     return process

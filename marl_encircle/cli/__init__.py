@@ -5,42 +5,63 @@ signal n.
 """
 
 import os
+import re
+from collections.abc import Callable
 from importlib.metadata import version
+from inspect import cleandoc
 from typing import Annotated
 
-import torch as th
 import typer
+from rich.markup import escape
 
 from marl_encircle import files, locks
 from marl_encircle.cli import configs, machine, results, runs, sweeps, watching
-from marl_encircle.core.simulator import PlacementError
-from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.study.calibrate import CalibrationError
 
 app = typer.Typer(
     name="marl-encircle",
     help="Encircle a faster target: train, evaluate and compare, and reproduce Zheng et al. (2023).",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
 )
-app.command("train")(runs.train_command)
-app.command("evaluate")(runs.evaluate)
-app.command("watch")(watching.watch)
-app.command("sweep")(sweeps.sweep_command)
-app.command("calibrate")(sweeps.calibrate_command)
-app.command("tables")(results.tables)
-app.command("figures")(results.figures)
-app.command("report")(results.report_command)
-app.command("reproduce-tables")(results.reproduce_tables)
-app.command("verify-results")(results.verify_results)
-app.command("bench")(machine.bench)
-
 config_app = typer.Typer(no_args_is_help=True, help="Show, compare and check configurations.")
-config_app.command("show")(configs.show)
-config_app.command("diff")(configs.diff)
-config_app.command("validate")(configs.validate)
-app.add_typer(config_app, name="config")
+
+EXAMPLES: dict[str, tuple[str, ...]] = {}
+"""What the help of each command teaches by."""
+
+
+def _add(name: str, command: Callable[..., None], panel: str, *examples: str) -> None:
+    """Add a command with its docstring as its help, at whatever width, and its examples below the options."""
+    paragraphs = cleandoc(command.__doc__ or "").split("\n\n")
+    group, _, last = name.rpartition(" ")
+    EXAMPLES[name] = examples
+    (config_app if group else app).command(
+        last,
+        help="\n\n".join(escape(re.sub(r"\s+", " ", paragraph)) for paragraph in paragraphs),
+        epilog="\n".join(["[bold]Examples[/bold]", *(f"  marl-encircle {name} {escape(line)}" for line in examples)]),
+        rich_help_panel=panel,
+    )(command)
+
+
+ONE, MANY, STUDY, ABOUT = "One run", "Many runs", "What runs show", "Settings and surroundings"
+RUN = "results/runs/ours/ratio1.1_n3_m1_random/seed0"
+
+_add("train", runs.train_command, ONE, "--pursuers 3 --obstacles 1", "--reward model_b --set training.n_worlds=32")
+_add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --episodes 1000 --seed 77 --json")
+_add("watch", watching.watch, ONE, "ours --pursuers 3 --obstacles 1", "ours --versus model_b --save round.gif")
+_add("sweep", sweeps.sweep_command, MANY, "committed --jobs 2", "smoke --out trial/runs --json")
+_add("calibrate", sweeps.calibrate_command, MANY, "--jobs 2")
+_add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --jobs 2", "--grid smoke --out trial --json")
+_add("tables", results.tables, STUDY, "--grid committed")
+_add("figures", results.figures, STUDY, "--grid committed")
+_add("report", results.report_command, STUDY, "--grid committed")
+_add("verify-results", results.verify_results, STUDY, "--grid committed")
+_add("config show", configs.show, ABOUT, "--reward ma2019 --pursuers 4", "--scenario paper --json")
+_add("config diff", configs.diff, ABOUT, "ours model_b", "default paper --json")
+_add("config validate", configs.validate, ABOUT, "ablations/ours.yaml")
+app.add_typer(config_app, name="config", rich_help_panel=ABOUT)
+_add("bench", machine.bench, ABOUT, "")
 
 
 def _print_version(wanted: bool) -> None:
@@ -57,7 +78,7 @@ def _options(
     ] = False,
 ) -> None:
     """Keep what concerns every command."""
-    th.set_num_threads(1)  # results are promised per thread count
+    os.environ["OMP_NUM_THREADS"] = "1"  # torch reads it at its import; results are promised per thread count
     os.environ["MARL_ENCIRCLE_DEBUG"] = "1" if debug else ""
 
 
@@ -65,18 +86,29 @@ def main() -> None:
     """Run the command; errors become one message and an exit code."""
     try:
         app()
-    except (ConfigError, PlacementError, locks.FolderLockedError) as error:
-        _fail(error, 2)
-    except (files.DamagedFileError, locks.UnfitLockError) as error:
-        _fail(error, 3)
-    except Stopped as stopped:
-        _fail(stopped, 128 + stopped.signum)
-    except (CalibrationError, OSError) as error:
-        _fail(error, 1)
+    except Exception as error:
+        code = _exit_code(error)
+        if code is None or os.environ.get("MARL_ENCIRCLE_DEBUG"):
+            raise
+        typer.echo(str(error) if code > 128 else f"error: {error}", err=True)
+        raise SystemExit(code) from None
 
 
-def _fail(error: Exception, code: int) -> None:
-    if os.environ.get("MARL_ENCIRCLE_DEBUG"):
-        raise error
-    typer.echo(f"error: {error}" if not isinstance(error, Stopped) else str(error), err=True)
-    raise SystemExit(code)
+def _exit_code(error: Exception) -> int | None:
+    """Return the exit code for an error that is no fault of the program, else None."""
+    if isinstance(error, (ConfigError, locks.FolderLockedError)):
+        return 2
+    if isinstance(error, (files.DamagedFileError, locks.UnfitLockError)):
+        return 3
+    if isinstance(error, OSError):
+        return 1
+    # These modules take seconds to import; what they raise comes from there.
+    from marl_encircle.core.simulator import PlacementError
+    from marl_encircle.experiments.callbacks import Stopped
+    from marl_encircle.study.calibrate import CalibrationError
+
+    if isinstance(error, PlacementError):
+        return 2
+    if isinstance(error, CalibrationError):
+        return 1
+    return 128 + error.signum if isinstance(error, Stopped) else None

@@ -1,52 +1,117 @@
-"""Options that several commands have, and what they become."""
+"""Options that several commands have, and what they become.
+
+Commands import what they need when they run: help and completion wait for no torch.
+"""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from marl_encircle.experiments.config import Config, Profile, load_config
-from marl_encircle.experiments.executors import Executor, LocalExecutor
-from marl_encircle.experiments.ray_executor import RayExecutor
-from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.cli.completion import names_of, scenes
 
-RewardOption = Annotated[str, typer.Option(help="A method's name, or the path of a YAML file. See 'config show'.")]
+if TYPE_CHECKING:
+    from marl_encircle.experiments.config import Config
+    from marl_encircle.experiments.executors import Executor
+
+SETTING, OUTPUT, CLUSTER = "Setting", "Output", "Cluster"
+"""Panels of the help."""
+
+# The same as those of experiments.config and experiments.build, which take seconds to import.
+Profile = Literal["full", "smoke"]
+Engine = Literal["native", "supersuit"]
+ExecutorName = Literal["local", "ray"]
+
+RewardOption = Annotated[
+    str, typer.Option(metavar="METHOD", autocompletion=names_of("reward"), help="A method's name, or a YAML file.")
+]
 ScenarioOption = Annotated[
-    str, typer.Option(help="The world's rules: default, paper (the study's), or the path of a YAML file.")
+    str,
+    typer.Option(
+        metavar="RULES",
+        autocompletion=names_of("scenario"),
+        rich_help_panel=SETTING,
+        help="The world's rules: default, paper (the study's), or a YAML file.",
+    ),
 ]
 # Those that are not given are the scenario's own.
 SpeedRatio = Annotated[
-    float | None, typer.Option(help="Target speed / pursuer speed.", show_default="the scenario's; 1.1 in default")
+    float | None,
+    typer.Option(
+        metavar="LAMBDA",
+        rich_help_panel=SETTING,
+        help="Target speed / pursuer speed.",
+        show_default="the scenario's; 1.1 in default",
+    ),
 ]
-Pursuers = Annotated[int | None, typer.Option(help="Number of pursuers.", show_default="the scenario's; 3 in default")]
+Pursuers = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        rich_help_panel=SETTING,
+        help="Number of pursuers.",
+        show_default="the scenario's; 3 in default",
+    ),
+]
 Obstacles = Annotated[
-    int | None, typer.Option(help="Number of obstacles.", show_default="the scenario's; 1 in default")
+    int | None,
+    typer.Option(
+        metavar="M",
+        rich_help_panel=SETTING,
+        help="Number of obstacles.",
+        show_default="the scenario's; 1 in default",
+    ),
 ]
 Scene = Annotated[
     str | None,
     typer.Option(
+        metavar="SCENE",
+        autocompletion=scenes,
+        rich_help_panel=SETTING,
         help="What an obstacle looks like: random, concave or tunnel.",
         show_default="the scenario's; random in default",
     ),
 ]
-Algorithm = Annotated[str, typer.Option(help="maddpg, matd3, or the path of a YAML file.")]
+Algorithm = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", autocompletion=names_of("algorithm"), help="maddpg, matd3, or the path of a YAML file."
+    ),
+]
 ProfileOption = Annotated[Profile, typer.Option(help="full, or smoke for a few seconds.")]
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override: section.key=value. May be repeated.")]
-Out = Annotated[Path, typer.Option(help="Folder of runs.")]
-Results = Annotated[Path, typer.Option(help="Folder of runs/ and tables/.")]
-Jobs = Annotated[int, typer.Option(min=1, help="Runs at a time, one processor core each.")]
-ExecutorName = Literal["local", "ray"]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override section.key=value. May be repeated.")
+]
+GridOption = Annotated[
+    str,
+    typer.Option(
+        metavar="GRID",
+        autocompletion=names_of("grid"),
+        help="Whose runs: committed, smoke, all, or the path of a YAML file.",
+    ),
+]
+Out = Annotated[Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs.")]
+Results = Annotated[Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs/ and tables/.")]
+AsJson = Annotated[bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print one JSON object.")]
+Quiet = Annotated[bool, typer.Option("--quiet", rich_help_panel=OUTPUT, help="No progress bar.")]
+Jobs = Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time, one processor core each.")]
 ExecutorOption = Annotated[
     ExecutorName,
     typer.Option(
-        "--executor", help="local: this machine; ray: a Ray cluster, all of whose nodes see the folder of runs."
+        "--executor",
+        rich_help_panel=CLUSTER,
+        help="local: this machine; ray: a Ray cluster, all of whose nodes see the folder of runs.",
     ),
 ]
 Address = Annotated[
-    str | None, typer.Option(help="Ray cluster, HOST:PORT. Default: one on this machine alone, on loopback.")
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        rich_help_panel=CLUSTER,
+        help="Ray cluster.",
+        show_default="one on this machine alone, on loopback",
+    ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
 
 
 def read_config(
@@ -59,12 +124,13 @@ def read_config(
     algorithm: str,
     profile: Profile,
     overrides: list[str] | None,
-) -> Config:
+) -> "Config":
     """Return the configuration that the options describe.
 
-    Raises:
-        ConfigError: It is wrong.
+    :raises ConfigError: if it is wrong
     """
+    from marl_encircle.experiments.config import load_config
+
     given = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
     fields = {name: value for name, value in given.items() if value is not None}
     return load_config(
@@ -72,12 +138,15 @@ def read_config(
     )
 
 
-def make_executor(name: ExecutorName, address: str | None) -> Executor:
+def make_executor(name: ExecutorName, address: str | None) -> "Executor":
     """Return what runs a sweep's jobs.
 
-    Raises:
-        ConfigError: An address without Ray.
+    :raises ConfigError: for an address without Ray
     """
+    from marl_encircle.experiments.executors import LocalExecutor
+    from marl_encircle.experiments.ray_executor import RayExecutor
+    from marl_encircle.experiments.yaml_files import ConfigError
+
     if name == "ray":
         return RayExecutor(address)
     if address is not None:

@@ -1,10 +1,11 @@
 """How commands print and how they end."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from marl_encircle.experiments.sweep import Progress
+if TYPE_CHECKING:
+    from marl_encircle.experiments.sweep import Progress
 
 
 def print_pairs(values: dict[str, Any]) -> None:
@@ -14,7 +15,7 @@ def print_pairs(values: dict[str, Any]) -> None:
         typer.echo(f"{key:<{width}}  {value:.4f}" if isinstance(value, float) else f"{key:<{width}}  {value}")
 
 
-def exit_if_failed(progress: Progress) -> None:
+def exit_if_failed(progress: "Progress") -> None:
     """Name the runs that failed and exit with 1; return where none did."""
     for name in progress.failed:
         typer.echo(f"failed: {name}", err=True)

@@ -1,34 +1,30 @@
 """What is made from runs: tables, figures, the report, and the proof that they can be made again."""
 
+import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from tqdm import tqdm
 
-from marl_encircle.cli.options import Address, ExecutorOption, Jobs, Quiet, Results, make_executor
+from marl_encircle.cli.options import Address, AsJson, ExecutorOption, GridOption, Jobs, Quiet, Results, make_executor
 from marl_encircle.cli.printing import exit_if_failed
-from marl_encircle.experiments.grid import load_grid
-from marl_encircle.experiments.live import LiveReport
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.study.reproduce import reproduce, write_tables
-from marl_encircle.study.verify import verify
 
 
-def tables(
-    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
-    out: Results = Path("results"),
-) -> None:
+def tables(grid: GridOption = "committed", out: Results = Path("results")) -> None:
     """Render the tables from the existing runs."""
+    from marl_encircle.experiments.grid import load_grid
+    from marl_encircle.study.reproduce import write_tables
+
     for path in write_tables(load_grid(grid), out):
         typer.echo(str(path))
 
 
-def figures(
-    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
-    out: Results = Path("results"),
-) -> None:
+def figures(grid: GridOption = "committed", out: Results = Path("results")) -> None:
     """Draw Figures 1 and 3 to 6 from the runs there are."""
+    from marl_encircle.experiments.grid import load_grid
+
     try:
         from marl_encircle.study.figures.write import write_figures
     except ImportError as error:
@@ -37,37 +33,41 @@ def figures(
         typer.echo(str(path))
 
 
-def report_command(
-    grid: Annotated[str, typer.Option(help="The grid whose runs are shown.")] = "committed",
-    out: Results = Path("results"),
-) -> None:
+def report_command(grid: GridOption = "committed", out: Results = Path("results")) -> None:
     """Write report.html: tables, learning curves and a player of rounds, in one file that needs no network."""
+    from marl_encircle.experiments.grid import load_grid
     from marl_encircle.study.report.write import write_report
 
     typer.echo(str(write_report(load_grid(grid), out)))
 
 
 def reproduce_tables(
-    grid: Annotated[str, typer.Option(help="committed, smoke, all, or the path of a YAML file.")] = "committed",
-    out: Results = Path("results"),
+    grid: GridOption = "committed",
     jobs: Jobs = 1,
     executor: ExecutorOption = "local",
     address: Address = None,
+    out: Results = Path("results"),
+    as_json: AsJson = False,
 ) -> None:
     """Train and evaluate what is missing of a grid, and render Tables 1-4 beside the paper's numbers."""
+    from marl_encircle.experiments.live import LiveReport
+    from marl_encircle.study.reproduce import reproduce
+
     workers = make_executor(executor, address)
     with LiveReport() as report:
         done = reproduce(grid, out, jobs, report, workers)
-    for number in (2, 3, 4):
-        typer.echo((out / "tables" / f"table{number}.md").read_text(encoding="utf-8"))
-    typer.echo(f"trained={done.trained} evaluated={done.evaluated} reused={done.reused}")
+    counts = {"trained": done.trained, "evaluated": done.evaluated, "reused": done.reused}
+    if as_json:
+        typer.echo(json.dumps({**counts, "failed": len(done.sweep.failed), "diverged": done.sweep.diverged}))
+    else:
+        for number in (2, 3, 4):
+            typer.echo((out / "tables" / f"table{number}.md").read_text(encoding="utf-8"))
+        typer.echo(" ".join(f"{name}={count}" for name, count in counts.items()))
     exit_if_failed(done.sweep)
 
 
 def verify_results(
-    grid: Annotated[str, typer.Option(help="The grid whose runs are verified.")] = "committed",
-    out: Results = Path("results"),
-    quiet: Quiet = False,
+    grid: GridOption = "committed", out: Results = Path("results"), quiet: Quiet = False, as_json: AsJson = False
 ) -> None:
     """Play every committed policy's rounds again, render its tables again, and compare. Nothing is written.
 
@@ -75,16 +75,22 @@ def verify_results(
     S must lie within its 99 % binomial interval. Exit code 3 where that does not hold, and where there is no finished
     run.
     """
+    from marl_encircle.experiments.grid import load_grid
+    from marl_encircle.study.verify import verify
+
     with tqdm(unit="run", disable=quiet) as bar:
         found = verify(load_grid(grid), out, lambda done, total: _advance(bar, done, total))
-    check = "every figure of every round" if found.exact else "how the rounds end: another processor than the runs'"
     if not found.rounds:
         typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
         raise typer.Exit(3)
-    typer.echo(f"check: {check}")
-    for name in found.changed:
-        typer.echo(f"changed: {out / name}")
-    typer.echo(f"rounds={found.rounds} equal={found.equal} cells_off={found.cells_off}")
+    if as_json:
+        typer.echo(json.dumps({"passed": found.passed, **found._asdict()}))
+    else:
+        check = "every figure of every round" if found.exact else "how the rounds end: another processor than the runs'"
+        typer.echo(f"check: {check}")
+        for name in found.changed:
+            typer.echo(f"changed: {out / name}")
+        typer.echo(f"rounds={found.rounds} equal={found.equal} cells_off={found.cells_off}")
     if not found.passed:
         raise typer.Exit(3)
 

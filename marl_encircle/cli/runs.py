@@ -2,13 +2,16 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from marl_encircle import files
 from marl_encircle.cli.options import (
+    OUTPUT,
     Algorithm,
     AsJson,
+    Engine,
     Obstacles,
     Out,
     ProfileOption,
@@ -22,35 +25,41 @@ from marl_encircle.cli.options import (
     read_config,
 )
 from marl_encircle.cli.printing import print_pairs
-from marl_encircle.experiments.build import Engine, load_run
-from marl_encircle.experiments.evaluate import play_rounds
-from marl_encircle.experiments.metrics import summarise_run
-from marl_encircle.experiments.records import read_record
-from marl_encircle.experiments.train import train, write_episodes
 from marl_encircle.experiments.yaml_files import ConfigError
 
 
 def train_command(
     reward: RewardOption = "ours",
+    algorithm: Algorithm = "maddpg",
+    seed: Annotated[int, typer.Option(metavar="SEED", help="Training seed.")] = 0,
+    scenario: ScenarioOption = "default",
     speed_ratio: SpeedRatio = None,
     pursuers: Pursuers = None,
     obstacles: Obstacles = None,
     scene: Scene = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Training seed.")] = 0,
-    scenario: ScenarioOption = "default",
-    algorithm: Algorithm = "maddpg",
-    engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
     profile: ProfileOption = "full",
+    engine: Annotated[Engine, typer.Option(help="native: fast; supersuit: the reference. Equal results.")] = "native",
     overrides: Set = None,
+    checkpoint_every: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0,
+            metavar="SECONDS",
+            help="Seconds between checkpoints.",
+            show_default="so that they take 2 % of the time",
+        ),
+    ] = None,
     out: Out = Path("results/runs"),
-    checkpoint_every: Annotated[float, typer.Option(min=1.0, help="Seconds between checkpoints.")] = 120.0,
-    tensorboard: Annotated[bool, typer.Option(help="Write event files into the run folder.")] = True,
+    tensorboard: Annotated[
+        bool, typer.Option(rich_help_panel=OUTPUT, help="Write event files into the run folder.")
+    ] = True,
     quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped.
+    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped."""
+    from marl_encircle.experiments.records import read_record
+    from marl_encircle.experiments.train import train
 
-    Example: marl-encircle train --reward ablations/my_idea.yaml --pursuers 4 --set training.world_steps=200000
-    """
     config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
     folder, worked = train(
         config,
@@ -61,30 +70,63 @@ def train_command(
         progress_bar=not quiet,
         tensorboard=tensorboard,
     )
-    diverged = read_record(folder).get("status") == "diverged"
+    record = read_record(folder)
+    diverged = record["status"] == "diverged"
     if not worked:
         typer.echo("already finished", err=True)
     if diverged:
         typer.echo("diverged: the run is kept and counted as diverged; try another seed or configuration", err=True)
-    typer.echo(str(folder))
+    typer.echo(json.dumps(_outcome(folder, record)) if as_json else str(folder))
     if diverged:
         raise typer.Exit(1)
+
+
+def _outcome(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
+    """Return what became of a run; one that diverged has no rounds, and so no success."""
+    from marl_encircle.experiments.metrics import summarise_run
+    from marl_encircle.experiments.records import episodes_from_csv
+
+    success = length = None
+    if "episodes.csv" in record["sha256"]:
+        data = files.read_bytes(folder / "episodes.csv", sha256=record["sha256"]["episodes.csv"])
+        own = summarise_run(episodes_from_csv(data.decode()), record["config"]["reward"]["closure"])
+        success, length = own.success, own.mean_episode_length
+    return {
+        "folder": str(folder),
+        "status": record["status"],
+        "success": success,
+        "mean_episode_length": length,
+        "world_steps": record["world_steps"],
+        "cpu_seconds": record["cpu_seconds"],
+    }
 
 
 def evaluate(
     run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
     episodes: Annotated[
-        int | None, typer.Option(min=1, max=10**6, help="Rounds to play. Default: as many as the run's configuration.")
+        int | None,
+        typer.Option(min=1, max=10**6, metavar="N", help="Rounds to play.", show_default="as the run's configuration"),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Evaluation seed. Default: that of the run's configuration.")
+        int | None,
+        typer.Option(min=0, metavar="SEED", help="Evaluation seed.", show_default="that of the run's configuration"),
     ] = None,
-    as_json: AsJson = False,
     write: Annotated[
-        bool, typer.Option("--write", help="Replace the episodes.csv of a finished run; only with the default rounds.")
+        bool,
+        typer.Option(
+            "--write",
+            rich_help_panel=OUTPUT,
+            help="Replace the episodes.csv of a finished run; only with the default rounds.",
+        ),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Play rounds with a trained policy, noise off, and print how they ended."""
+    from marl_encircle.experiments.build import load_run
+    from marl_encircle.experiments.evaluate import play_rounds
+    from marl_encircle.experiments.metrics import summarise_run
+    from marl_encircle.experiments.train import write_episodes
+
     policy, config, record = load_run(run_dir)
     own_rounds = config.evaluation.episodes, config.evaluation.seed
     episodes = own_rounds[0] if episodes is None else episodes

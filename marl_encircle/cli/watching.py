@@ -5,39 +5,103 @@ from typing import Annotated
 
 import typer
 
-from marl_encircle.envs.view import Layer, Layers
+from marl_encircle.cli.completion import names_of, scenes
+from marl_encircle.cli.options import SETTING
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.replays.watch import find_match
+from marl_encircle.spelling import nearest
+
+FILM, ROUND = "In place of the window", "Which rounds"
 
 
 def watch(
     method: Annotated[
-        str, typer.Argument(help="A method's name, a run folder, or with --policy the YAML file of a reward.")
+        str,
+        typer.Argument(
+            autocompletion=names_of("reward"),
+            help="A method's name, a run folder, or with --policy the YAML file of a reward.",
+        ),
     ] = "ours",
+    versus: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD", autocompletion=names_of("reward"), help="Another METHOD beside it, in the same rounds."
+        ),
+    ] = None,
+    policy: Annotated[
+        Path | None, typer.Option(metavar="RUN_DIR", help="A run folder: its policy, under METHOD's reward.")
+    ] = None,
+    fps: Annotated[float, typer.Option(min=0.5, max=50, metavar="FPS", help="Steps per second.")] = 6.0,
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LAYER",
+            help="Leave out circles, angles, area, trails or lens. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--results", metavar="DIR", help="Folder of runs/.", show_default="results, then the package's own"
+        ),
+    ] = None,
     speed_ratio: Annotated[
-        float | None, typer.Option(help="Target speed / pursuer speed of the run.", show_default="1.1")
+        float | None,
+        typer.Option(
+            metavar="LAMBDA",
+            rich_help_panel=SETTING,
+            help="Target speed / pursuer speed of the run.",
+            show_default="1.1",
+        ),
     ] = None,
-    pursuers: Annotated[int | None, typer.Option(help="Number of pursuers of the run.", show_default="3")] = None,
-    obstacles: Annotated[int | None, typer.Option(help="Number of obstacles of the run.", show_default="1")] = None,
+    pursuers: Annotated[
+        int | None,
+        typer.Option(metavar="N", rich_help_panel=SETTING, help="Number of pursuers of the run.", show_default="3"),
+    ] = None,
+    obstacles: Annotated[
+        int | None,
+        typer.Option(metavar="M", rich_help_panel=SETTING, help="Number of obstacles of the run.", show_default="1"),
+    ] = None,
     scene: Annotated[
-        str | None, typer.Option(help="Play in this scene: random, concave or tunnel.", show_default="the run's")
+        str | None,
+        typer.Option(
+            metavar="SCENE",
+            autocompletion=scenes,
+            rich_help_panel=SETTING,
+            help="Play in this scene: random, concave or tunnel.",
+            show_default="the run's",
+        ),
     ] = None,
-    policy: Annotated[Path | None, typer.Option(help="A run folder: its policy, under METHOD's reward.")] = None,
-    versus: Annotated[str | None, typer.Option(help="Another METHOD beside it, in the same rounds.")] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Evaluation seed of the rounds.", show_default="7000, not reported ones")
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="SEED",
+            rich_help_panel=ROUND,
+            help="Evaluation seed of the rounds.",
+            show_default="7000, not reported ones",
+        ),
     ] = None,
-    round_number: Annotated[int, typer.Option("--round", min=0, max=10**6, help="The (first) round.")] = 0,
-    save: Annotated[Path | None, typer.Option(help="Write the round as a film, .gif or .mp4; no window.")] = None,
-    headless: Annotated[Path | None, typer.Option(help="Write every step as PNG into a folder; no window.")] = None,
-    fps: Annotated[float, typer.Option(min=0.5, max=50, help="Steps per second.")] = 6.0,
-    hide: Annotated[list[Layer] | None, typer.Option(help="A layer to leave out. May be repeated.")] = None,
-    out: Annotated[Path, typer.Option("--results", help="Folder of runs/.")] = Path("results"),
+    round_number: Annotated[
+        int,
+        typer.Option("--round", min=0, max=10**6, metavar="R", rich_help_panel=ROUND, help="The (first) round."),
+    ] = 0,
+    save: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", rich_help_panel=FILM, help="Write the round as a film, .gif or .mp4."),
+    ] = None,
+    headless: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", rich_help_panel=FILM, help="Write every step as PNG into a folder."),
+    ] = None,
 ) -> None:
-    """Play rounds of a trained policy in a window (h: its keys), or write one as a film or as pictures.
+    """Play rounds of a trained policy in a window (h: its keys), or write one as a film or as pictures."""
+    from marl_encircle.envs.view import Layers
+    from marl_encircle.replays.watch import find_match
 
-    Example: marl-encircle watch ours --pursuers 3 --obstacles 1 --versus model_b --save round.gif
-    """
+    for layer in hide or ():
+        if layer not in Layers._fields:
+            raise ConfigError(f"--hide {layer:.80}: unknown layer{nearest(layer, Layers._fields)}")
     try:
         from marl_encircle.replays import film, player
     except ImportError as error:
@@ -51,7 +115,7 @@ def watch(
     match = find_match(method, versus, out, fields, scene, policy, seed)
     for note in match.notes():
         typer.echo(note, err=True)
-    layers = Layers()._replace(**{layer.value: False for layer in hide or ()})
+    layers = Layers()._replace(**dict.fromkeys(hide or (), False))
     if save is not None:
         film.save(save, match, round_number, fps, layers)
         typer.echo(str(save))

@@ -17,7 +17,6 @@ from tiny_runs import (
     TINY,
     Done,
     Trained,
-    command,
     contents,
     copy_of_finished,
     everything_in,
@@ -27,7 +26,7 @@ from tiny_runs import (
 )
 
 from marl_encircle import cli, files, locks
-from marl_encircle.cli import configs, machine
+from marl_encircle.cli import kinds, machine
 from marl_encircle.experiments import executors, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
@@ -35,14 +34,6 @@ from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.metrics import wilson_interval
 
 Run = Callable[..., Done]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Run a command in this process, in an empty folder."""
-    (tmp_path / "cwd").mkdir()
-    monkeypatch.chdir(tmp_path / "cwd")
-    return lambda *arguments: command(capsys, monkeypatch, *arguments)
 
 
 @pytest.fixture
@@ -453,7 +444,8 @@ def test_reproduce_tables_ends_with_its_counts(run: Run, tmp_path: Path) -> None
     assert run(*arguments).out.splitlines()[-1] == "trained=0 evaluated=1 reused=1"
     assert {path: path.read_bytes() for path in (results / "tables").iterdir()} == tables
     listed = run("tables", "--grid", "smoke", "--out", results)
-    assert (listed.code, sorted(map(Path, listed.out.split()))) == (0, sorted(tables))
+    cards = (results / "runs").rglob("README.md")
+    assert (listed.code, sorted(map(Path, listed.out.split()))) == (0, sorted([*tables, *cards]))
     (folder / "episodes.csv").write_text("edited")
     for damaged in (run("tables", "--grid", "smoke", "--out", results), run(*arguments)):
         assert damaged.code == 3
@@ -477,41 +469,7 @@ def test_an_unknown_grid_ends_with_2_and_leaves_nothing(run: Run, tmp_path: Path
     assert everything_in(tmp_path) == before
 
 
-# config
-
-
-def test_config_show_prints_terms_and_weights_and_every_section(run: Run) -> None:
-    out = run("config", "show", "--reward", "ma2019", "--pursuers", "4").out
-    for text in ("ma2019: closure pursuers, one stage, scale 0.05", "encirclement_radius", "radius=0.15"):
-        assert text in out
-    for section in ("scenario", "algorithm", "training", "evaluation", "learning_rate", "safety_distance"):
-        assert section in out
-    assert "overall_angle" not in out
-    assert "methods: ma2019, model_a, model_b, model_c, ours" in out
-
-
-def test_config_show_as_json_is_the_resolved_configuration(run: Run) -> None:
-    done = run("config", "show", "--profile", "smoke", "--obstacles", "2", "--set", "training.n_worlds=3", "--json")
-    expected = load_config(profile="smoke", fields={"obstacles": 2}, overrides=["training.n_worlds=3"])
-    assert json.loads(done.out) == expected.to_dict()
-
-
-def test_config_diff_says_what_differs_and_where(run: Run) -> None:
-    assert run("config", "diff", "ours", "model_b").out.splitlines() == [
-        "reward.name: ours in ours, model_b in model_b",
-        "reward.two_stage: True in ours, False in model_b",
-    ]
-    assert run("config", "diff", "ours", "ours").out == ""
-
-
-def test_config_validate_says_valid_or_what_is_wrong(run: Run, tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text("base: ours\nterms: {contraction: 2.0}\n")
-    assert run("config", "validate", path) == (0, "valid\n", "")
-    path.write_text("base: ours\nterms: {contration: 2.0}\n")
-    done = run("config", "validate", path)
-    assert (done.code, done.out) == (2, "")
-    assert "reward.terms.contration: unknown reward term; did you mean contraction?" in done.err
+# the command itself
 
 
 def test_every_command_says_what_it_does(run: Run) -> None:
@@ -548,7 +506,7 @@ def test_the_version_is_the_packages(run: Run) -> None:
 
 
 def test_an_interrupt_while_it_starts_ends_with_130_and_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "torch.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
     done = subprocess.run(
         [sys.executable, "-m", "marl_encircle", "--version"],
         env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
@@ -558,7 +516,7 @@ def test_an_interrupt_while_it_starts_ends_with_130_and_no_traceback(tmp_path: P
 
 
 def test_an_interrupt_in_a_command_ends_with_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(configs, "load_config", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(kinds, "load_config", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     done = run("config", "validate", "ours")
     assert (done.code, done.out) == (130, "")
     assert "Traceback" not in done.err
@@ -570,4 +528,4 @@ def test_the_module_is_the_command(tmp_path: Path) -> None:
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: reward 'our': neither a known name nor a .yaml path; did you mean ours?\n"
+    assert done.stderr == "error: 'our': neither a known name nor a .yaml path; did you mean ours?\n"
