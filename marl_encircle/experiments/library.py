@@ -21,6 +21,8 @@ PROTOCOLS = ("calibration",)
 """Files of ``configs/paper/`` that are protocols; the others are grids."""
 
 MAX_BASES = 20
+MAX_NAME = 1000
+"""Characters of a name or path."""
 
 
 def files_of(kind: Kind) -> dict[str, Path]:
@@ -77,6 +79,8 @@ def find_file(name: str, kind: Kind) -> Path:
 
     :raises ConfigError: naming the nearest name of that kind
     """
+    if not name.isprintable() or len(name) > MAX_NAME:
+        raise ConfigError(f"{kind} must be a name or the path of a YAML file; got {name!r:.80}")
     if is_path(name):
         return Path(name)
     known = files_of(kind)
@@ -108,12 +112,15 @@ def _chain(name: str, kind: Kind) -> list[tuple[Path, dict[str, Any]]]:
         if len(seen) > MAX_BASES:
             raise ConfigError(f"{path}: more than {MAX_BASES} nested bases")
         seen.append(real)
-        values = read_yaml(path)
+        try:
+            values = read_yaml(path)
+        except ConfigError as error:
+            raise ConfigError(f"{error}; the base of {chain[-1][0]}" if chain else str(error)) from error
         base = values.pop("base", None)
         chain.append((path, values))
         if base is None:
             return chain
-        if not isinstance(base, str) or not base.isprintable() or len(base) > 1000:
+        if not isinstance(base, str) or not base.isprintable() or len(base) > MAX_NAME:
             raise ConfigError(f"{path}: base must be a name or a path; got {base!r:.80}")
         try:
             path = path.parent / base if is_path(base) else find_file(base, kind)

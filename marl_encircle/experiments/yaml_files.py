@@ -4,6 +4,7 @@ YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a duplicate key
 """
 
 import datetime
+import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,13 +37,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
     :raises ConfigError: if there is no such file, it is larger than 128 kB, no YAML, no mapping, or has more in it than
         mappings, lists, strings, finite numbers, booleans and null
     """
-    if path.exists() and not path.is_file():  # what is no file may never end
-        raise ConfigError(f"{path}: not a regular file")
     try:
-        with path.open("rb") as file:
+        regular = path.is_file() or not path.exists()  # what is no file may never end
+        with path.open("rb") if regular else io.BytesIO() as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    if not regular:
+        raise ConfigError(f"{path}: not a regular file")
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{path}: larger than {MAX_BYTES // 1000} kB")
     try:
