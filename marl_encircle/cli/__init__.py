@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from marl_encircle import files, locks
-from marl_encircle.cli import configs, machine, results, runs, sweeps, watching
+from marl_encircle.cli import configs, machine, results, runs, sweeps, tensorboard, watching
 from marl_encircle.experiments.yaml_files import ConfigError
 
 app = typer.Typer(
@@ -56,6 +56,7 @@ _add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --job
 _add("tables", results.tables, STUDY, "--grid committed")
 _add("figures", results.figures, STUDY, "--grid committed")
 _add("report", results.report_command, STUDY, "--grid committed")
+_add("tensorboard", tensorboard.tensorboard_command, STUDY, "", "--out trial --port 6010")
 _add("verify-results", results.verify_results, STUDY, "--grid committed")
 _add("config show", configs.show, ABOUT, "--reward ma2019 --pursuers 4", "--scenario paper --json")
 _add("config diff", configs.diff, ABOUT, "ours model_b", "default paper --json")

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +26,9 @@ from marl_encircle.cli.options import (
 )
 from marl_encircle.cli.printing import print_pairs
 from marl_encircle.experiments.yaml_files import ConfigError
+
+if TYPE_CHECKING:
+    from marl_encircle.experiments.tensorboard import Draw
 
 
 def train_command(
@@ -51,7 +54,10 @@ def train_command(
     ] = None,
     out: Out = Path("results/runs"),
     tensorboard: Annotated[
-        bool, typer.Option(rich_help_panel=OUTPUT, help="Write event files into the run folder.")
+        bool,
+        typer.Option(
+            rich_help_panel=OUTPUT, help="Write event files into the run folder; pictures need the extra render."
+        ),
     ] = True,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -69,6 +75,7 @@ def train_command(
         checkpoint_every=checkpoint_every,
         progress_bar=not quiet,
         tensorboard=tensorboard,
+        draw=_thumbnails(quiet) if tensorboard else None,
     )
     record = read_record(folder)
     diverged = record["status"] == "diverged"
@@ -79,6 +86,17 @@ def train_command(
     typer.echo(json.dumps(_outcome(folder, record)) if as_json else str(folder))
     if diverged:
         raise typer.Exit(1)
+
+
+def _thumbnails(quiet: bool) -> "Draw | None":
+    """Return how rounds are drawn for TensorBoard; None, and one note, where they cannot be."""
+    try:
+        from marl_encircle.replays.thumbnails import thumbnails
+    except ImportError:
+        if not quiet:
+            typer.echo("no pictures of rounds in the event files: pip install 'marl-encircle[render]'", err=True)
+        return None
+    return thumbnails
 
 
 def _outcome(folder: Path, record: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,8 @@ The steps are SB3's, those of all agents: world steps times pursuers. All that i
 selection rounds, which are never reported.
 """
 
+import csv
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,8 +13,11 @@ from typing import Any, NamedTuple
 from stable_baselines3.common import logger
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
+from marl_encircle import files
 from marl_encircle.core.rewards import TERMS
+from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.records import MAX_FILE, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -202,3 +207,51 @@ def _in_words(value: Any) -> str:
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+class Shown(NamedTuple):
+    """How many runs TensorBoard is given, by where their curves come from."""
+
+    recorded: int
+    """From ``progress.csv``."""
+    own: int
+    """From their own event files."""
+
+
+def gather(runs: Path, folder: Path) -> Shown:
+    """Lay all runs out for TensorBoard, named ``<method>/<setting>/seed<s>``.
+
+    A run with event files of its own is linked to, so that one in training goes on being seen. Of one that has none, as
+    those in the repository, the learning curve is written under the tags of a training.
+
+    :param runs: folder of all runs
+    :param folder: an empty one
+    :raises DamagedFileError: for a finished run that is not what its record says
+    """
+    recorded = own = 0
+    for run in sorted(runs.glob("*/*/seed*")):
+        shown = folder / run.relative_to(runs)
+        if any((run / "tensorboard").glob("events.out.tfevents.*")):
+            shown.parent.mkdir(parents=True, exist_ok=True)
+            shown.symlink_to((run / "tensorboard").resolve(), target_is_directory=True)
+            own += 1
+        elif (run / "run.json").exists():
+            _write_curve(run, shown)
+            recorded += 1
+    return Shown(recorded, own)
+
+
+def _write_curve(run: Path, folder: Path) -> None:
+    """Write the learning curve of a finished run as event files."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    record = read_record(run)
+    config = config_of(record, run)
+    data = files.read_bytes(run / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE)
+    with SummaryWriter(folder) as writer:
+        describe(writer, config, record["seed"])
+        for row in csv.DictReader(io.StringIO(data.decode())):
+            steps = int(row.pop("world_steps")) * config.scenario.pursuers
+            for name, value in row.items():
+                if value:
+                    writer.add_scalar(f"eval/{name}", float(value), steps)

@@ -12,13 +12,13 @@ from marl_encircle.replays.film import gif, png
 from marl_encircle.replays.replay import Replay, record_first_rounds
 from marl_encircle.replays.watch import end_of, view_of
 
-SIDE, STRIP = 300, 26
+SIDE, STRIP = 260, 24
 """Side of a scene, height of the line below it [pixels]."""
 
 ENDS = 4
 """Rounds of which the end is shown, two in a row."""
 
-FRAMES = 12
+FRAMES = 9
 """Of a film, at most."""
 
 FPS = 4.0
@@ -36,7 +36,7 @@ def thumbnails(policy: MADDPGPolicy, config: Config) -> list[Picture]:
         sheet.blit(end, (place % 2 * width, place // 2 * height))
     return [
         Picture("selection_rounds/first_round", gif(frames, FPS), width, height),
-        Picture("selection_rounds/ends", png(array_of(sheet)), *sheet.get_size()),
+        Picture("selection_rounds/ends", png(array_of(sheet), optimize=False), *sheet.get_size()),
     ]
 
 
