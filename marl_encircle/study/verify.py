@@ -54,6 +54,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     :param report: called with the number of runs verified and of all
     :raises DamagedFileError: if a run is not what its record says
     """
+    texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
     folders = [folder for folder in folders if (folder / "episodes.csv").exists()]
     rounds = equal = 0
@@ -61,7 +62,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)
     for done, folder in enumerate(folders, start=1):
         policy, config, record = load_run(folder)
-        same_processor = record["cpu"] == cpu_model()
+        same_processor = record.get("cpu") == cpu_model()
         exact &= same_processor
         closure = config.reward.closure
         for setting in (None, *grid.elsewhere.get(config.cell.setting, ())):
@@ -79,7 +80,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
         if report is not None:
             report(done, len(folders))
     off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())
-    changed = [name for name, text in render(grid, results).items() if _read(Path(results) / name) != text.encode()]
+    changed = [name for name, text in texts.items() if _read(Path(results) / name) != text.encode()]
     return Verification(rounds, equal, off, exact, tuple(changed))
 
 

@@ -212,10 +212,31 @@ def test_points_that_a_seed_lacks_are_left_out() -> None:
     assert joint.mean.tolist() == pytest.approx([0.7, 0.8])
 
 
-@pytest.mark.parametrize("text", ["world_steps\n3\n", "world_steps,success\n3\n", "world_steps,success\n3,many\n"])
-def test_a_learning_curve_without_numbers_is_refused(text: str) -> None:
-    with pytest.raises(ValueError):
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "no points"),
+        ("world_steps,success\n", "no points"),
+        ("world_steps\n3\n", "must be in every line"),
+        ("world_steps,success\n3\n", "must be in every line"),
+        ("world_steps,success\n3,many\n", "could not convert"),
+        ("world_steps,success\n3,nan\n", "success must be between 0 and 1"),
+        ("world_steps,success\n3,1.1\n", "success must be between 0 and 1"),
+        ("world_steps,success\n3,0.1\n3,0.1\n", "world_steps must rise"),
+        ("world_steps,success\n-3,0.1\n", "world_steps must rise"),
+        (f"world_steps,success\n{'9' * 30},0.1\n", "world_steps: too large"),
+        (f"world_steps,success\n3,{'1' * 200_000}\n", "not CSV"),
+    ],
+)
+def test_a_learning_curve_that_cannot_be_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
         curve_from_csv(text)
+
+
+def test_curves_of_seeds_without_a_common_step_are_refused() -> None:
+    texts = ("world_steps,success\n100,0.5\n", "world_steps,success\n200,0.8\n")
+    with pytest.raises(ValueError, match="no step in common"):
+        band_of([curve_from_csv(text) for text in texts], 200)
 
 
 def test_figure_5_draws_the_summaries() -> None:

@@ -60,14 +60,26 @@ def curve_from_csv(text: str) -> Curve:
     """Read ``progress.csv``.
 
     :param text: content of the file
-    :raises ValueError: without the columns ``world_steps`` and ``success``, or for what is no number in them
+    :raises ValueError: without points, without the columns ``world_steps`` and ``success``, or for what is no count of
+        steps, rising, or no share in them
     """
-    rows = list(csv.DictReader(io.StringIO(text)))
     try:
+        rows = list(csv.DictReader(io.StringIO(text)))
         steps = np.array([int(row["world_steps"]) for row in rows], np.int64)
-        return Curve(steps, np.array([float(row["success"]) for row in rows]))
+        success = np.array([float(row["success"]) for row in rows])
+    except csv.Error as error:
+        raise ValueError(f"not CSV: {error}") from error
+    except OverflowError as error:
+        raise ValueError("world_steps: too large") from error
     except (KeyError, TypeError) as error:
         raise ValueError("world_steps and success must be in every line") from error
+    if not rows:
+        raise ValueError("no points")
+    if steps[0] < 0 or (np.diff(steps) <= 0).any():
+        raise ValueError("world_steps must rise from line to line")
+    if not ((success >= 0) & (success <= 1)).all():
+        raise ValueError("success must be between 0 and 1")
+    return Curve(steps, success)
 
 
 def band_of(curves: Sequence[Curve], rounds: int) -> Band:
@@ -75,8 +87,11 @@ def band_of(curves: Sequence[Curve], rounds: int) -> Band:
 
     :param curves: one or more
     :param rounds: that were played at each point; see :func:`~marl_encircle.experiments.metrics.share_interval`
+    :raises ValueError: if they have none in common
     """
     steps = np.array(sorted(set.intersection(*(set(curve.world_steps.tolist()) for curve in curves))), np.int64)
+    if not len(steps):
+        raise ValueError("the learning curves of the seeds have no step in common")
     success = np.stack([curve.success[np.isin(curve.world_steps, steps)] for curve in curves])
     intervals = [interval for point in success.T if (interval := share_interval(point.tolist(), rounds))]
     if not intervals:

@@ -80,7 +80,15 @@ def read_bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
                 raise files.DamagedFileError(path / "progress.csv", str(error)) from error
             by_cell.setdefault(run.cell, []).append(curve)
             rounds[run.cell] = record["config"]["evaluation"]["curve_episodes"]
-    return {cell: band_of(found, rounds[cell]) for cell, found in by_cell.items()}
+    return {cell: _band_of(cell, found, rounds[cell], folder) for cell, found in by_cell.items()}
+
+
+def _band_of(cell: Cell, found: Sequence[curves.Curve], rounds: int, folder: Path) -> Band:
+    """Gather the curves of a cell; raise a DamagedFileError that names its folder where they do not fit together."""
+    try:
+        return band_of(found, rounds)
+    except ValueError as error:
+        raise files.DamagedFileError((folder / run_path(cell, 0)).parent, str(error)) from error
 
 
 def _summaries(runs: Sequence[Run]) -> Mapping[Cell, CellSummary]:
