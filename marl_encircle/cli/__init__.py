@@ -50,6 +50,7 @@ RUN = "results/runs/ours/ratio1.1_n3_m1_random/seed0"
 _add("train", runs.train_command, ONE, "--pursuers 3 --obstacles 1", "--reward model_b --set training.n_worlds=32")
 _add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --episodes 1000 --seed 77 --json")
 _add("watch", watching.watch, ONE, "ours --pursuers 3 --obstacles 1", "ours --versus model_b --save round.gif")
+_add("export", runs.export, ONE, RUN, f"{RUN} --to torchscript --out pursuers.pt --json")
 _add("sweep", sweeps.sweep_command, MANY, "committed --jobs 2", "smoke --out trial/runs --json")
 _add("calibrate", sweeps.calibrate_command, MANY, "--jobs 2")
 _add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --jobs 2", "--grid smoke --out trial --json")
@@ -106,10 +107,11 @@ def _exit_code(error: Exception) -> int | None:
     # These modules take seconds to import; what they raise comes from there.
     from marl_encircle.core.simulator import PlacementError
     from marl_encircle.experiments.callbacks import Stopped
+    from marl_encircle.experiments.export import ParityError
     from marl_encircle.study.calibrate import CalibrationError
 
     if isinstance(error, PlacementError):
         return 2
-    if isinstance(error, CalibrationError):
+    if isinstance(error, (CalibrationError, ParityError)):
         return 1
     return 128 + error.signum if isinstance(error, Stopped) else None

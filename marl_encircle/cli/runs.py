@@ -1,8 +1,8 @@
-"""One run: train it, evaluate it."""
+"""One run: train it, evaluate it, export it."""
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -187,3 +187,42 @@ def evaluate(
         typer.echo(json.dumps(result))
     else:
         print_pairs(result)
+
+
+def export(
+    run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
+    to: Annotated[
+        Literal["onnx", "torchscript", "torch-export"],
+        typer.Option(
+            metavar="FORMAT",
+            help="onnx; torchscript, which torch has deprecated; or torch-export, which it reads in its place.",
+        ),
+    ] = "onnx",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            rich_help_panel=OUTPUT,
+            help="The file.",
+            show_default="<method>_<setting>_seed<s>.onnx, .pt or .pt2",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the actors of a run as one file that is used without this package.
+
+    It maps observations (worlds, agents, numbers) to actions, and says whose they are in its metadata. On 1,000 random
+    observations and on those of 16 rounds it must act as the policy does, to 1e-5; else there is no file, and exit
+    code 1.
+    """
+    from marl_encircle.experiments.export import export_run
+
+    done = export_run(run_dir, to, out)
+    differences = {"difference_random": done.random, "difference_played": done.played}
+    if done.description["status"] == "diverged":
+        typer.echo("warning: this run diverged; its policy is the last one of its training", err=True)
+    if as_json:
+        typer.echo(json.dumps({"file": str(done.path), **differences, **done.description}))
+    else:
+        typer.echo(f"largest difference from predict: {done.random:.1e} random, {done.played:.1e} played", err=True)
+        typer.echo(str(done.path))

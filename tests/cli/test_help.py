@@ -15,7 +15,7 @@ import pytest
 from tiny_runs import TINY, Done, copy_of_finished, tiny, tiny_arguments, train_in_this_process
 
 from marl_encircle import cli
-from marl_encircle.cli import machine, options
+from marl_encircle.cli import machine, options, tensorboard
 from marl_encircle.experiments import build, config, grid
 from marl_encircle.experiments.train import train
 from marl_encircle.study import calibrate
@@ -98,7 +98,8 @@ def example_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def checkout(run: Run, monkeypatch: pytest.MonkeyPatch, example_runs: Path) -> Run:
     """The command in a folder like a checkout, where trainings are tiny."""
     Path("ablations").symlink_to(ROOT / "ablations")
-    shutil.copytree(example_runs, "results/runs")
+    for results in ("results", "trial"):
+        shutil.copytree(example_runs, f"{results}/runs")
     monkeypatch.setattr(grid, "load_config", load_tiny)
     train_in_this_process(monkeypatch)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
@@ -119,6 +120,7 @@ def long_calibration(*_: object) -> None:
 def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, example: str) -> None:
     monkeypatch.setattr(calibrate, "calibrate", long_calibration)
     monkeypatch.setattr(write, "write_figures", lambda *_: ["results/figures/figure1.svg"])
+    monkeypatch.setattr(tensorboard, "_serve", lambda *_: 0)
     monkeypatch.setattr(machine, "subprocess", SimpleNamespace(run=lambda *_, **__: SimpleNamespace(returncode=0)))
     arguments = shlex.split(
         example.replace("--grid committed", "--grid smoke").replace("sweep committed", "sweep smoke")
@@ -133,7 +135,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
         assert "use --save FILE.gif to write a film, or --headless DIR for pictures" in done.err
     else:
         assert done.code == 0, done.err
-        assert done.out or arguments[0] == "bench"
+        assert done.out or arguments[0] in ("bench", "tensorboard")
     if "--json" in arguments:
         assert json.loads(done.out)
 
