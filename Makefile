@@ -105,8 +105,8 @@ reproduce-tables: $(READY)  ## the whole road: train, evaluate, render: GRID JOB
 bench: $(READY)  ## measure the speed, into benchmarks/results.json
 	$(CLI) bench
 
-tensorboard: $(READY)  ## watch the runs in a browser: RESULTS
-	$(BIN)/tensorboard --logdir $(RESULTS)/runs
+tensorboard: $(READY)  ## the learning curves of all runs in a browser, on this machine alone: RESULTS
+	$(CLI) tensorboard --out $(RESULTS)
 
 clean:  ## remove caches and builds; .venv and results stay
 	rm -rf build dist .cache .coverage* .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
