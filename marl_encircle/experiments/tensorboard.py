@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a training: curves and their layout, the configuration as tables, rounds as pictures.
+"""Event files for TensorBoard: those of a training, with rounds as pictures, and those of learning curves.
 
 The steps are SB3's, those of all agents: world steps times pursuers. All that is under ``eval/`` comes from the
 selection rounds, which are never reported.
@@ -6,7 +6,7 @@ selection rounds, which are never reported.
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +14,9 @@ from stable_baselines3.common import logger
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from marl_encircle import files
-from marl_encircle.core.rewards import TERMS
 from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.descriptions import CURVES, describe
 from marl_encircle.experiments.records import MAX_FILE, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
@@ -26,30 +26,6 @@ MOMENTS = 5
 
 WORLD_STEPS_BETWEEN = 200_000
 """From one such point to the next, at least."""
-
-METRICS = ("eval/success", "eval/mean_episode_length", "eval/sigma_c")
-"""What hyper-parameters are judged by; not the reported rounds, since choosing by them would spoil the report."""
-
-LAYOUT = {
-    "Selection rounds": {
-        "success, the method's own rule": ["Multiline", ["eval/success$"]],
-        "mean episode length (MEL) of the successful rounds": ["Multiline", ["eval/mean_episode_length"]],
-        "success under both rules": ["Multiline", ["eval/success_all", "eval/success_pursuers"]],
-    },
-    "Losses": {
-        "critic": ["Multiline", ["train/critic_loss"]],
-        "actor": ["Multiline", ["train/actor_loss"]],
-    },
-    "Curriculum": {
-        "difficulty": ["Multiline", ["curriculum/.+"]],
-        "success in training": ["Multiline", ["rounds/success_.+"]],
-    },
-    "Reward": {
-        "terms, per round": ["Multiline", ["reward/.+"]],
-        "return": ["Multiline", ["rollout/ep_rew_mean"]],
-    },
-}
-"""Charts of the custom scalars by category; tags are regular expressions."""
 
 
 class Picture(NamedTuple):
@@ -130,83 +106,12 @@ def is_drawn(config: Config, point: int) -> bool:
     return point * moments // points > (point - 1) * moments // points
 
 
-def describe(writer: Any, config: Config, seed: int) -> None:
-    """Write what is trained: the charts' layout, the configuration as tables, the hyper-parameters.
-
-    :param writer: PyTorch's ``SummaryWriter``
-    """
-    from torch.utils.tensorboard.summary import hparams
-
-    writer.add_custom_scalars(LAYOUT)
-    for tag, text in texts(config, seed).items():
-        writer.add_text(tag, text, 0)
-    values = hyperparameters(config, seed)
-    for summary in hparams(values, dict.fromkeys(METRICS, 0.0)):  # type: ignore[no-untyped-call]
-        writer.file_writer.add_summary(summary)
-    writer.flush()
-
-
 def add_picture(writer: Any, picture: Picture, steps: int) -> None:
     """Write a picture as it is: PyTorch's ``add_video`` needs moviepy, and not even its present version."""
     from tensorboard.compat.proto.summary_pb2 import Summary
 
     image = Summary.Image(height=picture.height, width=picture.width, colorspace=3, encoded_image_string=picture.data)
     writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=picture.tag, image=image)]), steps)
-
-
-def texts(config: Config, seed: int) -> dict[str, str]:
-    """Return Markdown by tag: the reward, and the other sections of the resolved configuration."""
-    values, reward = config.to_dict(), config.reward
-    head = f"**{reward.name}**: closure {reward.closure}, {'two stages' if reward.two_stage else 'one stage'}"
-    active = reward.build().active.items()
-    terms = [(name, f"{weight:g}", _in_words(parameters)) for name, (weight, parameters) in active]
-    sections = [
-        f"### {section}\n\n"
-        + _table(("key", "value"), [(key, _in_words(value)) for key, value in values[section].items()])
-        for section in ("scenario", "algorithm", "training", "evaluation")
-    ]
-    return {
-        "reward": f"{head}, scale {reward.scale:g}\n\n{_table(('term', 'weight', 'parameters'), terms)}",
-        "configuration": "\n\n".join([f"Training seed {seed}.", *sections]),
-    }
-
-
-def hyperparameters(config: Config, seed: int) -> dict[str, str | float]:
-    """Return the setting, what learns and what it is rewarded for; a reward term that is off has weight 0."""
-    values = config.to_dict()
-    active = config.reward.build().active
-    chosen = {
-        "method": config.reward.name,
-        **config.cell.setting._asdict(),
-        "seed": seed,
-        "training": {key: values["training"][key] for key in ("n_worlds", "world_steps")},
-        "algorithm": values["algorithm"],
-        "reward": {key: values["reward"][key] for key in ("closure", "two_stage", "scale")},
-        "weight": {name: active[name][0] if name in active else 0.0 for name in TERMS},
-    }
-    return dict(_flat(chosen))
-
-
-def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str | float]]:
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value if isinstance(value, (str, float, int)) else _in_words(value)
-
-
-def _in_words(value: Any) -> str:
-    """Return a value in one line."""
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_in_words(inner)}" for key, inner in value.items())
-    if isinstance(value, (list, tuple)):
-        return ", ".join(map(_in_words, value))
-    return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 class Shown(NamedTuple):
@@ -249,7 +154,7 @@ def _write_curve(run: Path, folder: Path) -> None:
     config = config_of(record, run)
     data = files.read_bytes(run / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE)
     with SummaryWriter(folder) as writer:
-        describe(writer, config, record["seed"])
+        describe(writer, config, record["seed"], CURVES)
         for row in csv.DictReader(io.StringIO(data.decode())):
             steps = int(row.pop("world_steps")) * config.scenario.pursuers
             for name, value in row.items():
