@@ -60,19 +60,21 @@ def write_json(path: str | Path, value: object) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def write_bytes(path: str | Path, data: bytes) -> None:
+def write_bytes(path: str | Path, *pieces: bytes | memoryview, former: Path | None = None) -> None:
     """Write a file as a whole.
 
     :param path: the file; missing folders are made
-    :param data: its new content
+    :param pieces: its new content, one after the other
+    :param former: see :func:`atomic_path`
     :raises OSError: with the file's name; the old file is unchanged
     """
-    with atomic_path(path) as temporary:
+    with atomic_path(path, former) as temporary:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
+            for piece in pieces:
+                rest = memoryview(piece)
+                while rest:
+                    rest = rest[os.write(descriptor, rest) :]
         finally:
             os.close(descriptor)
 

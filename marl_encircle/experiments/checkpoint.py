@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import safetensors
-import safetensors.numpy
 import torch as th
 
 from marl_encircle import files
@@ -78,12 +77,27 @@ def save_tree(path: Path, tree: Mapping[str, Any], former: Path | None = None) -
     :param former: name that the old file takes
     """
     arrays: dict[str, np.ndarray] = {}
-    plain = _take_arrays(tree, "", arrays)
-    with files.atomic_path(path, former) as temporary:
-        text = json.dumps(plain)
-        # One entry: safetensors writes several in an order that changes from call to call.
-        checked = f"{files.sha256_bytes(text.encode())} {text}"
-        safetensors.numpy.save_file(arrays, temporary, metadata={"tree": checked})
+    text = json.dumps(_take_arrays(tree, "", arrays))
+    checked = f"{files.sha256_bytes(text.encode())} {text}"
+    pieces = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
+    files.write_bytes(path, _header(arrays, {"tree": checked}), *pieces, former=former)
+
+
+def _header(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> bytes:
+    """Return what comes before the arrays in a safetensors file.
+
+    The library's own ``save_file`` leaves a temporary file of its own where it is killed, and its errors hide those of
+    the disk; its ``save`` holds everything in memory twice.
+    """
+    header: dict[str, Any] = {"__metadata__": metadata}
+    end = 0
+    for name, array in arrays.items():
+        start, end = end, end + array.nbytes
+        kind = "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
+        header[name] = {"dtype": kind, "shape": array.shape, "data_offsets": (start, end)}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # the arrays start at a multiple of 8
+    return len(text).to_bytes(8, "little") + text
 
 
 def load_tree(path: Path) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 import io
 import pathlib
 import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -27,6 +29,7 @@ from stable_baselines3.common.utils import FloatSchedule, should_collect_more_st
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from torch import nn
 
+from marl_encircle import files
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
 from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
@@ -424,6 +427,31 @@ class MADDPG(OffPolicyAlgorithm):
             if successes:
                 self.ep_success_buffer.append(np.mean(successes))
 
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save the model to a zip-file as SB3 does, whole or not at all: a former file stays until the new one is.
+
+        :param path: the file, with the suffix ``.zip`` if it has none
+        :param exclude: attributes to leave out
+        :param include: attributes to save although SB3 leaves them out
+        :raises OSError: with the file's name; the former file is unchanged
+        """
+        with _whole(path, ".zip") as target:
+            super().save(target, exclude, include)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Save the replay buffer to a pickle file as SB3 does, whole or not at all.
+
+        :param path: the file, with the suffix ``.pkl`` if it has none
+        :raises OSError: with the file's name; the former file is unchanged
+        """
+        with _whole(path, ".pkl") as target:
+            super().save_replay_buffer(target)
+
     @classmethod
     def load(
         cls: type[SelfMADDPG],
@@ -488,6 +516,19 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
     policy.actor.load_state_dict({name.removeprefix(prefix): saved[name] for name in saved if name.startswith(prefix)})
     policy.set_training_mode(False)
     return policy
+
+
+@contextmanager
+def _whole(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> Iterator[io.BufferedIOBase]:
+    """Yield a file for SB3 to save to, which becomes ``path`` in the end; an open one is yielded itself."""
+    if isinstance(path, io.BufferedIOBase):
+        yield path
+        return
+    path = pathlib.Path(path)
+    path = path if path.suffix else path.with_name(path.name + suffix)
+    # Opened here: SB3 would leave it open where the disk is full.
+    with files.atomic_path(path) as temporary, temporary.open("wb") as file:
+        yield file
 
 
 def count_agents(env: GymEnv | None, n_agents: int | None) -> int:

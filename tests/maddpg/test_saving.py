@@ -1,0 +1,74 @@
+"""``save`` and ``save_replay_buffer`` keep SB3's format, and a former file until the new one is whole."""
+
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faults import ERRNOS, fail_everywhere, largest_file, temporary_files
+from test_maddpg import load, make_model, weights_hash
+
+from marl_encircle.maddpg import MADDPG
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_suffixes_and_missing_folders_are_added_as_sb3_does(tmp_path: Path) -> None:
+    model = make_model()
+    model.save(tmp_path / "new" / "model")
+    model.save(str(tmp_path / "new" / "v1.2"))
+    model.save_replay_buffer(tmp_path / "new" / "buffer")
+    assert names(tmp_path / "new") == ["buffer.pkl", "model.zip", "v1.2"]
+    assert weights_hash(load(MADDPG, tmp_path / "new" / "model")) == weights_hash(model)
+    with warnings.catch_warnings():
+        model.load_replay_buffer(tmp_path / "new" / "buffer")
+
+
+def test_an_open_file_is_written_to_as_it_is() -> None:
+    model, data, buffer = make_model(), io.BytesIO(), io.BytesIO()
+    model.save(data)
+    model.save_replay_buffer(buffer)
+    data.seek(0)
+    assert weights_hash(load(MADDPG, data)) == weights_hash(model)  # type: ignore[arg-type]  # SB3 takes both
+    assert len(buffer.getvalue()) > 1000
+
+
+def test_every_call_may_fail(tmp_path: Path) -> None:
+    former, new = make_model(seed=0), make_model(seed=1)
+    assert weights_hash(former) != weights_hash(new)
+    for number in ERRNOS:
+
+        def check(folder: Path, error: OSError | None) -> None:
+            saved = load(MADDPG, folder / "model.zip")
+            assert weights_hash(saved) == weights_hash(new if error is None else former)
+            assert temporary_files(folder) == []
+
+        above = tmp_path / str(number)
+        above.mkdir()
+        calls = fail_everywhere(
+            above,
+            lambda folder: former.save(folder / "model"),
+            lambda folder: new.save(folder / "model"),
+            check,
+            number,
+        )
+        assert calls.count("fsync") == 2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_full_disk_keeps_the_former_model(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "model.zip"
+    former, new = make_model(seed=0), make_model(seed=1)
+    former.save(path)
+    former.save_replay_buffer(tmp_path / "buffer.pkl")
+    for save, saved in ((new.save, path), (new.save_replay_buffer, tmp_path / "buffer.pkl")):
+        data = saved.read_bytes()
+        with largest_file(int(share * len(data))), pytest.raises(OSError, match="not saved"):
+            save(saved)
+        assert saved.read_bytes() == data
+    assert names(tmp_path) == ["buffer.pkl", "model.zip"]
+    new.learn(12)
+    assert np.isfinite(new.replay_buffer.rewards).all()  # type: ignore[union-attr]  # there is one
