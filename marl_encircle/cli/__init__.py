@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from marl_encircle import files, locks
-from marl_encircle.cli import configs, machine, results, runs, sweeps, tensorboard, watching
+from marl_encircle.cli import configs, info, machine, results, runs, sweeps, tensorboard, watching
 from marl_encircle.experiments.yaml_files import ConfigError
 
 app = typer.Typer(
@@ -63,6 +63,7 @@ _add("config show", configs.show, ABOUT, "--reward ma2019 --pursuers 4", "--scen
 _add("config diff", configs.diff, ABOUT, "ours model_b", "default paper --json")
 _add("config validate", configs.validate, ABOUT, "ablations/ours.yaml")
 app.add_typer(config_app, name="config", rich_help_panel=ABOUT)
+_add("info", info.info, ABOUT, "", "--json")
 _add("bench", machine.bench, ABOUT, "")
 
 
