@@ -1,9 +1,16 @@
-"""One thread, as in the Makefile. Hypothesis: ``quick``, or HYPOTHESIS_PROFILE=thorough for 1,000 examples of a law."""
+"""One thread, as in the Makefile. Hypothesis: ``quick``, or HYPOTHESIS_PROFILE=thorough for 1,000 examples of a law.
+
+With NUMBA_DISABLE_JIT=1 the kernels are plain Python, for coverage and for mutants. Tests that need machine code, by kind
+or by the number of steps, are deselected then, and arithmetic on scalars warns as little as machine code.
+"""
 
 import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # libraries read it when they are imported
 
+import numba
+import numpy as np
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("quick", max_examples=25, deadline=None, derandomize=True, database=None)
@@ -12,3 +19,12 @@ settings.register_profile(
     "thorough", max_examples=1000, deadline=None, suppress_health_check=unhurried, print_blob=True
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+
+if numba.config.DISABLE_JIT:
+    np.seterr(divide="ignore", invalid="ignore", over="ignore")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if numba.config.DISABLE_JIT:
+        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("compiled")])
+        items[:] = [item for item in items if not item.get_closest_marker("compiled")]

@@ -131,6 +131,7 @@ def test_the_package_works_where_nothing_of_the_users_can_be_written(tmp_path: P
     assert out == f"{np.pi} {tmp_path} True"
 
 
+@pytest.mark.compiled
 def test_other_peoples_kernels_keep_their_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "theirs"))
     ours = compilation.kernel(lambda x: x + 1)
@@ -141,7 +142,7 @@ def test_other_peoples_kernels_keep_their_own_folder(tmp_path: Path, monkeypatch
     assert str(tmp_path / "theirs") == numba.config.CACHE_DIR
 
 
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+@pytest.mark.compiled
 def test_every_kernel_is_kept_in_our_folder() -> None:
     kernels = [f for module in (geometry, dynamics) for f in vars(module).values() if isinstance(f, CPUDispatcher)]
     assert len(kernels) > 8

@@ -346,6 +346,7 @@ def test_the_target_sees_the_pursuers_after_their_move_or_before() -> None:
         assert position(sim) == near(-0.2, 0.1)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("rule", ["literal", "relaxed"])
 @pytest.mark.parametrize("scene", ["random", "concave", "tunnel"])
 def test_a_target_that_moves_is_free_of_everything_afterwards(scene: str, rule: str) -> None:

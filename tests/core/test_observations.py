@@ -121,6 +121,7 @@ def test_only_the_worlds_asked_for_are_written() -> None:
     np.testing.assert_array_equal(out[[0, 2]], seen(sim)[[0, 2]])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("half_width", [1.0, 0.7, 3.0])
 def test_all_values_stay_within_the_bounds(half_width: float) -> None:
     scenario = Scenario(obstacles=2, obstacle_radius=0.1, half_width=half_width, max_speed=1.7, observe_extras=EXTRAS)

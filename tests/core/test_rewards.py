@@ -137,6 +137,7 @@ def test_one_pursuer_has_no_phase_difference_and_two_on_one_side_have_the_most()
     assert term("phase_difference", transition(arranged([(0.2, 0.1), (0.4, 0.2)]))) == near(-1, -1)
 
 
+@pytest.mark.compiled
 def test_terms_stay_in_the_ranges_that_they_promise() -> None:
     sim, rng = Simulator(Scenario(pursuers=4, obstacles=2), 64, 1), np.random.default_rng(1)
     sim.reset()
@@ -227,6 +228,7 @@ def test_a_term_must_return_a_number_for_each_pursuer_of_each_world(
         Reward({"wrong": 1.0}).parts(told())
 
 
+@pytest.mark.compiled
 def test_without_obstacles_model_a_and_ours_earn_the_same() -> None:
     model_a = Reward({**OURS, "obstacle_angle": None}, closure="pursuers")
     sim, rng = Simulator(Scenario(obstacles=0), 64, 1), np.random.default_rng(1)

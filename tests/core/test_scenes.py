@@ -92,6 +92,7 @@ def test_everything_starts_within_the_limits_and_at_rest(scenario: Scenario) -> 
     assert not np.shares_memory(s.obstacles, s.discs)
 
 
+@pytest.mark.compiled
 def test_positions_are_uniform_over_the_scene() -> None:
     s = drawn(Scenario(obstacles=2, placement="overlapping", half_width=2.0), 4000).state
     for points, width in ((s.pursuers[:, 0], 2.0), (s.target, 2.0), (s.obstacles[:, 1], 1.8)):
@@ -152,6 +153,7 @@ def test_from_inside_a_concave_obstacle_is_open_to_one_side_and_a_tunnel_at_both
     assert (np.linalg.norm(s["discs"][0, :, :2] - s["target"][0], axis=1) > s["discs"][0, :, 2] + 0.05).all(), "it fits"
 
 
+@pytest.mark.compiled
 def test_nearly_half_cover_can_be_placed_whatever_the_seed() -> None:
     # 14 x 0.04 + 4 x 0.0025 = 0.57 of 4 / pi: 44.8 %
     scenario = Scenario(obstacles=14)
@@ -171,6 +173,7 @@ INFEASIBLE = {
 }
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("n_worlds", [1, 256])
 @pytest.mark.parametrize("scenario", INFEASIBLE.values(), ids=INFEASIBLE)
 def test_an_infeasible_scene_is_a_clear_error_within_a_second(scenario: Scenario, n_worlds: int) -> None:

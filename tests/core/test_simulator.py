@@ -51,6 +51,7 @@ def test_the_seeds_of_worlds_never_change_from_release_to_release() -> None:
     assert world_seeds(7, 2) == [int(word) // 2 for word in first]
 
 
+@pytest.mark.compiled
 def test_a_world_is_the_same_alone_and_in_any_batch() -> None:
     together = Simulator(DENSE, 9, seed=4)
     alone = Simulator(DENSE, 1, seed=0)
@@ -93,6 +94,7 @@ def test_the_number_of_seeds_and_of_worlds_is_checked() -> None:
 # Resume
 
 
+@pytest.mark.compiled
 def test_a_resumed_simulator_goes_on_bit_for_bit() -> None:
     sim, rng = Simulator(DENSE, 5, seed=2), np.random.default_rng(3)
     sim.set_difficulty({"safety_distance": 0.2})
@@ -280,6 +282,7 @@ def degenerate(sim: Simulator, rng: np.random.Generator) -> None:
             s.target[b] = [1.0, 1.0 + 1e-9]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("scenario", FUZZED.values(), ids=FUZZED)
 def test_a_hundred_thousand_fuzzed_steps_are_finite(scenario: Scenario) -> None:
     # 6 scenarios x 64 worlds x 270 steps = 103,680
