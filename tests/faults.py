@@ -51,7 +51,7 @@ def failing_disk(folder: Path, call: int, number: int) -> Iterator[Fault]:
             if name == "close":
                 descriptors.discard(target)
             if fails and name != "close":
-                raise OSError(number, os.strerror(number))
+                raise OSError(number, os.strerror(number), *([] if isinstance(target, int) else [str(target)]))
             result = real(*arguments, **options)
             if fails:  # a descriptor is closed even where that fails
                 raise OSError(number, os.strerror(number))

@@ -178,6 +178,8 @@ ALLOWED = {
     "maddpg/maddpg.py": ["open", "save"],  # SB3's, to a path of `atomic_path`; so is its `save_replay_buffer`
     "experiments/build.py": ["save"],  # to bytes
     "experiments/checkpoint.py": ["replace"],  # a damaged checkpoint is put aside
+    "experiments/export.py": ["save", "save"],  # to bytes
+    "experiments/tensorboard.py": ["SummaryWriter", "mkdir", "symlink_to"],  # what TensorBoard shows of finished runs
     "replays/film.py": ["get_writer", "save", "save"],  # to a path of `atomic_path`, to bytes
     "study/figures/canvas.py": ["savefig"],  # to bytes
     "study/reproduce.py": ["unlink"],  # a table that there is no run for any more
