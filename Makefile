@@ -22,11 +22,15 @@ READY  := .venv/.ready
 TRAIN   = $(CLI) train --reward $(REWARD) --speed-ratio $(SPEED_RATIO) --pursuers $(PURSUERS) \
           --obstacles $(OBSTACLES) --scene $(SCENE) --seed $(SEED) --out $(RESULTS)/runs
 
+INSTALL = $(PYTHON) -m pip install $(PIP_ARGS) -c constraints.txt
+VERSIONS = $(INSTALL) -q -e '.[lock]' && $(PYTHON) tools/versions.py
+
 # One thread per process: runs are parallel by process, and results are promised per thread count.
 export OMP_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test soak test-sb3 check lint format format-check typecheck imports spelling \
+.PHONY: help setup test soak coverage mutation test-lowest test-newest test-sb3 check lint format format-check \
+        typecheck imports spelling supply-chain lock licences \
         train evaluate sweep tables figures report test-browser calibrate verify-results reproduce-tables bench tensorboard clean
 
 help:  ## list the targets and the variables
@@ -48,6 +52,23 @@ test: $(READY)  ## the tests (PYTEST_ARGS goes to pytest)
 
 soak: $(READY)  ## the promises that take long to see: kills, full disks, long sweeps; under 40 minutes
 	$(PYTHON) -m pytest -n 2 --timeout 1200 tests/soak $(PYTEST_ARGS)
+
+coverage: $(READY)  ## lines that the tests run, by module; the kernels as plain Python (PYTEST_ARGS goes to pytest)
+	rm -f .coverage
+	NUMBA_DISABLE_JIT=1 $(PYTHON) -m pytest -n 2 --cov --cov-report= $(PYTEST_ARGS) tests/core tests/envs tests/maddpg
+	$(PYTHON) -m pytest -n 2 --cov --cov-append --cov-report= $(PYTEST_ARGS) \
+	  --ignore tests/core --ignore tests/envs --ignore tests/maddpg tests
+	$(BIN)/coverage report --fail-under 95
+
+mutation: $(READY)  ## do the tests notice when the code is changed: at most an hour (MUTATION_ARGS)
+	$(INSTALL) -q -e '.[mutation]'
+	$(PYTHON) tools/mutation.py $(MUTATION_ARGS)
+
+test-lowest: $(READY)  ## the tests with the lowest versions that pyproject.toml allows
+	$(VERSIONS) lowest
+
+test-newest: $(READY)  ## the tests with the newest versions there are
+	$(VERSIONS) newest
 
 test-sb3: $(READY)  ## Stable-Baselines3's own tests on MADDPG and MATD3
 	$(PYTHON) tests/sb3_suite.py
@@ -71,6 +92,17 @@ imports: $(READY)  ## the layers
 
 spelling: $(READY)  ## codespell
 	$(BIN)/codespell
+
+supply-chain: $(READY)  ## is what is installed what is locked, with hashes
+	$(PYTHON) tools/supply_chain.py
+
+lock: $(READY)  ## write requirements.lock from constraints.txt: LOCK_ARGS, where the CPU wheel of torch is
+	$(INSTALL) -q -e '.[lock]'
+	$(BIN)/uv pip compile pyproject.toml --all-extras -c constraints.txt --generate-hashes --python $(PYTHON) \
+	  --no-annotate --custom-compile-command 'make lock' --quiet --output-file requirements.lock $(LOCK_ARGS)
+
+licences: $(READY)  ## write docs/licences.md from what is installed
+	$(PYTHON) tools/licences.py
 
 train: $(READY)  ## one training run: REWARD SPEED_RATIO PURSUERS OBSTACLES SCENE SEED RESULTS
 	$(TRAIN)

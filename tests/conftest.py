@@ -1,7 +1,7 @@
 """One thread, as in the Makefile. Hypothesis: ``quick``, or HYPOTHESIS_PROFILE=thorough for 1,000 examples of a law.
 
-With NUMBA_DISABLE_JIT=1 the kernels are plain Python, for coverage and for mutants. Tests that need machine code, by kind
-or by the number of steps, are deselected then, and arithmetic on scalars warns as little as machine code.
+With NUMBA_DISABLE_JIT=1 the kernels are plain Python, for coverage and for mutants. Tests that need machine code, by
+kind or by the number of steps, are deselected then, and arithmetic on scalars warns as little as machine code.
 """
 
 import os
