@@ -1,10 +1,9 @@
-"""What happens beside a training: logs, the learning curve, the progress bar, checkpoints, and signals."""
+"""What happens beside a training: logs, the learning curve, checkpoints, and signals."""
 
 import csv
 import io
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
 
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
@@ -204,30 +202,3 @@ class Checkpointer(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-
-class ProgressBar(BaseCallback):
-    """World steps done and left, and the success rate of the latest rounds.
-
-    :param total: world steps of the whole training
-    """
-
-    def __init__(self, curriculum: CurriculumVecEnv, total: int) -> None:
-        super().__init__()
-        self.curriculum, self.total = curriculum, total
-        self.latest: deque[bool] = deque(maxlen=200)
-
-    def _on_training_start(self) -> None:
-        self.bar: Any = tqdm(total=self.total, initial=self.curriculum.world_steps, unit="world steps")
-
-    def _on_step(self) -> bool:
-        self.latest.extend(info["is_success"] for info in ended_rounds(self, self.curriculum))
-        self.bar.update(self.curriculum.world_steps - self.bar.n)
-        if self.latest:
-            self.bar.set_postfix(success=f"{np.mean(self.latest):.0%}", refresh=False)
-        return True
-
-    def close(self) -> None:
-        """Leave the terminal as it was, however the training ended."""
-        if hasattr(self, "bar"):
-            self.bar.close()

@@ -29,14 +29,15 @@ from marl_encircle.experiments.build import (
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
     LearningCurve,
-    ProgressBar,
     RoundLogger,
     Stopped,
+    ended_rounds,
     stop_signals,
 )
 from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import (
     Episode,
@@ -145,7 +146,12 @@ class _Run:
         curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows, add_pictures)
         guard = DivergenceGuard(self.plan, self.folder / divergence.NAME)
         callbacks: list[BaseCallback] = [RoundLogger(curriculum), guard, curve]
-        bar = ProgressBar(curriculum, total)
+        bar = ProgressBar(
+            total,
+            lambda: curriculum.world_steps,
+            lambda step: (info["is_success"] for info in ended_rounds(step, curriculum)),
+            "success {:.0%}",
+        )
         if progress_bar:
             callbacks.append(bar)
         status = "finished"
