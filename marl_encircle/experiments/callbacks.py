@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
@@ -145,10 +146,11 @@ class LearningCurve(BaseCallback):
         rates = [summarise_run(episodes, rule).success for rule in ("all", "pursuers")]
         row = [self.curriculum.world_steps, own.success, own.mean_episode_length, *rates, own.sigma_c]
         self.rows.append(row)
+        point = Logger(None, self.logger.output_formats)  # written at once: the training's own log comes later
         for name, value in zip(self.COLUMNS[1:], row[1:], strict=True):
             if value is not None:
-                self.logger.record(f"eval/{name}", value)
-        self.model.dump_logs()  # at the steps of the point, and before a checkpoint that knows it
+                point.record(f"eval/{name}", value)
+        point.dump(self.model.num_timesteps)
         self.write()
         if self.add_pictures:
             self.add_pictures(self.model.policy, len(self.rows), self.model.num_timesteps)

@@ -117,7 +117,8 @@ def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str 
         if isinstance(value, Mapping):
             yield from _flat(value, f"{path}{key}.")
         else:
-            yield f"{path}{key}", value if isinstance(value, (str, float, int)) else _in_words(value)
+            is_number = isinstance(value, (float, int)) and not isinstance(value, bool)
+            yield f"{path}{key}", value if is_number else _in_words(value)
 
 
 def _in_words(value: Any) -> str:
@@ -126,7 +127,9 @@ def _in_words(value: Any) -> str:
         return ", ".join(f"{key} {_in_words(inner)}" for key, inner in value.items())
     if isinstance(value, (list, tuple)):
         return ", ".join(map(_in_words, value))
-    return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -71,15 +71,20 @@ class EventFiles(TensorBoardOutputFormat):
     def __init__(self, folder: Path, config: Config, seed: int, steps: int, draw: Draw | None = None) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
-        resumed = any(folder.glob("events.out.tfevents.*"))
+        earlier = list(folder.glob("events.out.tfevents.*"))
+        if steps == 0:  # the training starts over
+            for path in earlier:
+                path.unlink()
         super().__init__(str(folder))
         self.config, self.draw = config, draw
-        if resumed:
-            first = steps + 1 if steps else 0  # a training that starts over describes itself anew
+        if earlier and steps:
+            # The last point comes after the last checkpoint, at the same step.
+            is_trained = steps >= config.training.world_steps * config.scenario.pursuers
+            first = steps if is_trained else steps + 1
             writer: Any = self.writer.file_writer
             writer.add_event(Event(file_version="brain.Event:2"), first)
             writer.add_event(Event(session_log=SessionLog(status=SessionLog.START)), first)
-        if not (resumed and steps):
+        else:
             describe(self.writer, config, seed)
 
     def add_pictures(self, policy: MADDPGPolicy, point: int, steps: int) -> None:

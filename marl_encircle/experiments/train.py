@@ -170,6 +170,9 @@ class _Run:
             except Diverged as error:
                 logger.warning("%s", error)
                 status = "diverged"
+            else:
+                if "time/world_steps" in model.logger.name_to_value:  # else this very step has been logged
+                    model.dump_logs()
             finally:
                 bar.close()
                 model.logger.close()
