@@ -20,7 +20,7 @@ class Worker(Protocol):
     """A run that is being trained."""
 
     def poll(self) -> int | None:
-        """Return None while it works, then any number: what it did stands in the run folder."""
+        """Return None while it works, then a number, negative if it was killed: what it did is in the run folder."""
 
 
 class Executor(Protocol):

@@ -1,7 +1,9 @@
 """Many runs; whatever stops a sweep, the next one goes on from there."""
 
 import heapq
+import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +17,9 @@ from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.train import ended_run, run_folder
 
 POLL_SECONDS = 0.2
+MAX_RETRIES = 2
+
+logger = logging.getLogger(__name__)
 
 
 class Running(NamedTuple):
@@ -92,7 +97,9 @@ def sweep(
     report: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
 ) -> Progress:
-    """Train what is missing of ``jobs``.
+    """Train what is missing of ``jobs``; the run folders are the only journal.
+
+    A run whose worker was killed goes on from its checkpoint, at most ``MAX_RETRIES`` times.
 
     :param out: folder of runs; a second sweep on it is refused
     :param n_workers: runs at a time
@@ -132,6 +139,7 @@ def _train(
 ) -> None:
     """Keep as many workers busy as are allowed until nothing waits any more."""
     running: dict[Worker, Job] = {}
+    retries: Counter[Job] = Counter()
     with stop_signals() as caught:
         while waiting or running:
             while waiting and len(running) < progress.n_workers and not caught:
@@ -146,12 +154,25 @@ def _train(
                 job = running.pop(worker)
                 record = _record_of(job, out)
                 if record is None:
-                    progress.failed.append(name_of(job))
+                    if _was_killed(worker) and retries[job] < MAX_RETRIES:
+                        retries[job] += 1
+                        logger.warning(
+                            "%s: its process was killed; retry %d of %d", name_of(job), retries[job], MAX_RETRIES
+                        )
+                        waiting.append(job)
+                    else:
+                        progress.failed.append(name_of(job))
                     continue
                 _count(record, progress)
                 if record["status"] == "finished":
                     progress.cpu_seconds.append(record["cpu_seconds"])
     progress.running = []
+
+
+def _was_killed(worker: Worker) -> bool:
+    """Whether it ended by a signal: somebody's, or the kernel's for want of memory."""
+    code = worker.poll()
+    return code is not None and code < 0
 
 
 def _running(job: Job, out: str | Path) -> Running:

@@ -80,12 +80,38 @@ def test_runs_are_trained_once_and_then_reused(tmp_path: Path, monkeypatch: pyte
 def test_a_failed_run_is_counted_and_named_and_the_others_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made_up_worker(monkeypatch, "seed == 1 and os.kill(os.getpid(), signal.SIGKILL)\n" + finish())
+    made_up_worker(monkeypatch, "seed == 1 and sys.exit(1)\n" + finish())
     progress = sweep(JOBS, tmp_path, 1)
     assert counts(progress) == (2, 0, 0, 1, 0, 0)
     assert progress.failed == [name_of(JOBS[1])] == ["ours ratio1.1_n3_m1_random seed1"]
     made_up_worker(monkeypatch, finish())
     assert counts(sweep(JOBS, tmp_path, 1)) == (3, 2, 0, 0, 0, 0)
+
+
+DIE = """
+tries = folder / "tries"
+folder.mkdir(parents=True, exist_ok=True)
+tries.write_text(tries.read_text() + "x" if tries.exists() else "x")
+if seed == 1 and len(tries.read_text()) <= DEATHS:
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("deaths", [1, 2, 3])
+def test_a_killed_worker_is_followed_by_another_at_most_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, deaths: int
+) -> None:
+    finishing = finish().replace("folder.mkdir(parents=True)\n", "")
+    made_up_worker(monkeypatch, DIE.replace("DEATHS", str(deaths)) + finishing)
+    seen: list[int] = []
+    progress = sweep(JOBS, tmp_path, 2, lambda p: seen.append(p.done + len(p.failed) + len(p.running) + p.left))
+    assert counts(progress) == ((3, 0, 0, 0, 0, 0) if deaths <= 2 else (2, 0, 0, 1, 0, 0))
+    assert set(seen) == {3}
+    tries = (run_folder(JOBS[1].config, 1, tmp_path) / "tries").read_text()
+    assert len(tries) == min(deaths + 1, 3)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{name_of(JOBS[1])}: its process was killed; retry {i} of 2" for i in range(1, min(deaths, 2) + 1)
+    ]
 
 
 def test_a_diverged_run_is_counted_apart_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -380,6 +380,60 @@ def test_what_a_resume_leaves_out_is_noticed(tmp_path: Path, monkeypatch: pytest
     assert contents(folder)["policy.safetensors"] != contents(finished())["policy.safetensors"]
 
 
+def test_where_target_noise_is_drawn_its_generator_is_needed_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny(overrides=["algorithm.name=matd3"])
+    whole, _ = train.train(config, 0, "native", tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 50)
+        with pytest.raises(Stopped):
+            train.train(config, 0, "native", tmp_path / "parts")
+    path = train.run_folder(config, 0, tmp_path / "parts") / checkpoint.NAME
+    saved = checkpoint.load_tree(path)
+    saved["training"]["random"]["torch"] = th.Generator().manual_seed(7).get_state().numpy()
+    checkpoint.save_tree(path, saved)
+    folder, _ = train.train(config, 0, "native", tmp_path / "parts")
+    assert contents(folder)["policy.safetensors"] != contents(whole)["policy.safetensors"]
+
+
+def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jumps = itertools.cycle([0, 4e8, -3e8, 7, -86_400])  # seconds: years ahead, years back
+    now, now_ns = time.time, time.time_ns
+    monkeypatch.setattr(time, "time", lambda: now() + next(jumps))
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() + int(1e9 * next(jumps)))
+    folder, _ = train.train(tiny(), 0, "native", tmp_path, tensorboard=True, progress_bar=True)
+    assert contents(folder) == contents(finished())
+    record = read_record(folder)
+    assert 0 < record["cpu_seconds"] < 300
+    assert 0 < record["wall_seconds"] < 300
+
+
+def train_and_save_for_ever(out: Path) -> None:
+    """A training whose checkpoints take as long as one waits."""
+
+    def save(folder: Path, _tree: Any) -> None:
+        (folder / "saving").touch()
+        time.sleep(600)
+
+    checkpoint.save = save
+    train_slowly(out, "native", 1e9)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_second_signal_stops_a_training_at_once(tmp_path: Path, number: int) -> None:
+    process = in_another_process(train_and_save_for_ever, tmp_path)
+    folder = train.run_folder(tiny(), 0, tmp_path)
+    for wanted in ("progress.csv", "saving"):
+        deadline = time.monotonic() + 60
+        while not (folder / wanted).exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.kill(process.pid or 0, number)
+    process.join(30)
+    assert process.exitcode == (-number if number == signal.SIGTERM else 1), "an uncaught KeyboardInterrupt ends with 1"
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_a_process_stopped_by_a_signal_leaves_what_the_next_goes_on_from(
