@@ -228,7 +228,7 @@ def load_run(run: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
     data = files.read_bytes(folder / POLICY, sha256=record["sha256"][POLICY], max_bytes=MAX_POLICY_BYTES)
     policy = build_policy(config)
     try:
-        _load_weights(policy, data)
+        load_weights(policy, data)
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
         reason = f"does not hold this policy's weights: {_one_line(error)}"
         raise files.DamagedFileError(folder / POLICY, reason) from error
@@ -236,7 +236,7 @@ def load_run(run: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
     return policy, config, record
 
 
-def _load_weights(policy: MADDPGPolicy, data: bytes) -> None:
+def load_weights(policy: MADDPGPolicy, data: bytes) -> None:
     """Put the weights of a ``policy.safetensors`` into the actors; raise an error unless it holds just those."""
     if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
         raise ValueError(f"its header is larger than the {MAX_HEADER_BYTES} bytes allowed")
