@@ -31,7 +31,7 @@ export OMP_NUM_THREADS := 1
 .DEFAULT_GOAL := help
 .PHONY: help setup test soak coverage mutation test-lowest test-newest test-sb3 check lint format format-check \
         typecheck imports spelling supply-chain lock licences \
-        train evaluate sweep tables figures report test-browser calibrate verify-results reproduce-tables bench tensorboard clean
+        train evaluate sweep tables figures report test-browser calibrate verify-results reproduce-tables docs bench tensorboard clean
 
 help:  ## list the targets and the variables
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / {printf "  %-18s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -133,6 +133,10 @@ verify-results: $(READY)  ## play every committed policy again and compare: GRID
 
 reproduce-tables: $(READY)  ## the whole road: train, evaluate, render: GRID JOBS RESULTS
 	$(CLI) reproduce-tables --grid $(GRID) --out $(RESULTS) --jobs $(JOBS)
+
+docs: $(READY)  ## build the documentation into site/
+	$(INSTALL) -q -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 bench: $(READY)  ## measure the speed, into benchmarks/results.json
 	$(CLI) bench

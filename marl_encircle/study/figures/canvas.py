@@ -83,13 +83,16 @@ def style() -> Iterator[None]:
         yield
 
 
-def encode(figure: Figure) -> dict[str, bytes]:
-    """Return a figure's files by suffix: ``svg``, ``pdf`` and ``png``."""
+def encode(figure: Figure, suffixes: Sequence[str] = ()) -> dict[str, bytes]:
+    """Return a figure's files by suffix.
+
+    :param suffixes: the ones to make; ``svg``, ``pdf`` and ``png`` unless told
+    """
     encoded = {}
     with style():
-        for suffix, metadata in _METADATA.items():
+        for suffix in suffixes or _METADATA:
             data = io.BytesIO()
-            figure.savefig(data, format=suffix, metadata=metadata, dpi=_DPI)
+            figure.savefig(data, format=suffix, metadata=_METADATA[suffix], dpi=_DPI)
             encoded[suffix] = data.getvalue()
     return encoded
 
