@@ -28,9 +28,7 @@ def tensorboard_command(
         found = gather(out / "runs", Path(folder))
         if not any(found):
             raise ConfigError(f"{out / 'runs'}: no runs to show; train one, or choose another folder by --out")
-        typer.echo(
-            f"{found.recorded} runs from their learning curves, {found.own} from their own event files", err=True
-        )
+        typer.echo(f"runs: {found.recorded} from learning curves, {found.own} from their own event files", err=True)
         raise typer.Exit(_serve(folder, port))
 
 
