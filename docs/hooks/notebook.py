@@ -30,6 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         text, pictures = run(Path(config.docs_dir, file.src_uri))
         page = NotebookPage(file.src_uri, None, config.site_dir, config.use_directory_urls)
         page.content_string = text
+        files.remove(file)
         files.append(page)
         for name, data in pictures.items():
             files.append(File.generated(config, str(PurePosixPath(file.src_uri).parent / name), content=data))
