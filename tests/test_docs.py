@@ -11,6 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from documents import NOT_RUN, PAGES, ROOT, Session, blocks_of, lines_of, small
+from filelock import FileLock
 
 __all__ = ["small"]
 
@@ -90,16 +91,25 @@ class Page(HTMLParser):
             self.loaded.append(values["src"])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
-    """The built site, page by page."""
+    """The built site, page by page; built once, whichever of pytest's workers comes first."""
     pytest.importorskip("mkdocs", reason="MkDocs is not installed; it is in the extra 'docs'")
-    folder = tmp_path_factory.mktemp("site")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(build, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    folder, log = shared / "site", shared / "site.log"
+    with FileLock(shared / "site.lock"):
+        if not log.exists():
+            build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+            environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+            done = subprocess.run(
+                build, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False
+            )
+            log.write_text(f"exit code {done.returncode}\n{done.stderr}", encoding="utf-8")
+    said = log.read_text(encoding="utf-8")
+    assert said.startswith("exit code 0\n"), said
+    assert "WARNING" not in said
     return {path: Page(path) for path in folder.rglob("*.html")}
 
 
