@@ -15,6 +15,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.train import ended_run, run_folder
+from marl_encircle.experiments.trainable import check_trainings
 
 POLL_SECONDS = 0.2
 MAX_RETRIES = 2
@@ -106,10 +107,16 @@ def sweep(
     :param report: called whenever a run starts or ends, and several times a second in between
     :param executor: how they run; by default as processes of this machine
     :return: how it ended; ``failed`` names the runs that did not finish
+    :raises ConfigError: for a run that cannot be trained, or too many at a time for this machine's memory, before
+        anything is written
     :raises FolderLockedError: if another sweep works in ``out``
     :raises OtherRunError: if a finished run there has another configuration
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
     """
+    executor = executor or LocalExecutor()
+    if isinstance(executor, LocalExecutor):
+        missing = [job for job in jobs if not (run_folder(job.config, job.seed, out) / "run.json").exists()]
+        check_trainings([job.config for job in missing], n_workers)
     with locks.folder_lock(out):
         progress = Progress(len(jobs), n_workers)
         waiting = []
@@ -122,7 +129,7 @@ def sweep(
                 _count(record, progress)
         report = report or (lambda _: None)
         if waiting:
-            with executor or LocalExecutor() as workers:
+            with executor as workers:
                 _train(waiting, out, workers, progress, report)
         report(progress)
         return progress

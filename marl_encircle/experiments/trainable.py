@@ -1,7 +1,7 @@
 """What a configuration must hold to be trained on this machine; one that does not may still be shown and compared."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from marl_encircle.experiments.config import Config, build_scenario, count_weights, fields_of, observation_size
@@ -38,6 +38,23 @@ def check_training(config: Config) -> None:
             f"learnt; got {random}"
         )
     check_memory(memory_needed(config), available_memory())
+
+
+def check_trainings(configs: Sequence[Config], at_a_time: int) -> None:
+    """Refuse trainings one of which cannot be carried out, or that do not fit into this machine's memory together.
+
+    :param at_a_time: how many are trained side by side
+    :raises ConfigError: naming keys and figures
+    """
+    for config in configs:
+        check_training(config)
+    largest = sorted((sum(memory_needed(config).values()) for config in configs), reverse=True)[:at_a_time]
+    available = available_memory()
+    if sum(largest) > available:
+        raise ConfigError(
+            f"{len(largest)} trainings at a time need {sum(largest) / 1e9:.1f} GB of memory, but this machine has "
+            f"{available / 1e9:.1f} GB; use fewer jobs"
+        )
 
 
 def check_curriculum(config: Config) -> None:

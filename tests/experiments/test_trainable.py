@@ -11,11 +11,15 @@ from marl_encircle.experiments import trainable
 from marl_encircle.experiments.build import build_model, build_vec_env
 from marl_encircle.experiments.checkpoint import REPLAY
 from marl_encircle.experiments.config import load_config, observation_size
+from marl_encircle.experiments.grid import Job
+from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.sweep import sweep
 from marl_encircle.experiments.trainable import (
     available_memory,
     check_memory,
     check_seed,
     check_training,
+    check_trainings,
     memory_needed,
 )
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -138,6 +142,32 @@ def test_the_key_that_asks_for_most_is_named_with_the_figures(key: str, override
     assert str(caught.value) == (
         f"{key}: needs {figures[0]} of memory, of {figures[1]} in all, but this machine has {figures[2]}"
     )
+
+
+def test_trainings_must_fit_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small, large = tiny(), tiny(overrides=["algorithm.batch_size=3200"])
+    needs = {config.algorithm.batch_size: sum(memory_needed(config).values()) for config in (small, large)}
+    monkeypatch.setattr(trainable, "CONTAINER_LIMIT", tmp_path / "memory.max")
+    (tmp_path / "memory.max").write_text(str(needs[3200] + needs[32]))
+    configs = [small, large, small]
+    check_trainings(configs, 1)
+    check_trainings(configs, 2)
+    with pytest.raises(ConfigError, match=r"3 trainings at a time need 0\.0 GB of memory, .*; use fewer jobs"):
+        check_trainings(configs, 3)
+    (tmp_path / "memory.max").write_text(str(needs[3200] - 1))
+    with pytest.raises(ConfigError, match=r"algorithm\.batch_size: needs"):
+        check_trainings(configs, 1)
+    check_trainings([small], 1)
+    with pytest.raises(ConfigError, match="random_world_steps: must be less"):
+        check_trainings([small, tiny(overrides=["algorithm.random_world_steps=400"])], 1)
+
+
+def test_a_sweep_is_refused_before_it_touches_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "random.yaml").write_text("base: maddpg\nrandom_world_steps: 999999999\n")
+    job = Job("ours", Setting(1.1, 3, 1, "random"), 0, "smoke", algorithm=str(tmp_path / "random.yaml"))
+    with pytest.raises(ConfigError, match="random_world_steps: must be less"):
+        sweep([job], tmp_path / "runs", 1)
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(("text", "limit"), [("5000000\n", 5_000_000), ("max\n", None), ("9" * 30, None), ("", None)])
