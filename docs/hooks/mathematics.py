@@ -2,7 +2,7 @@
 
 import html
 import re
-from importlib import resources
+from importlib.util import find_spec
 from typing import Any
 
 from latex2mathml.converter import convert
@@ -17,8 +17,8 @@ _FONT = "STIXTwoMath-Regular.ttf"
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Put the font beside the style sheet that asks for it."""
-    path = resources.files("ziamath") / "fonts" / _FONT
-    files.append(File.generated(config, f"theme/{_FONT}", content=path.read_bytes()))
+    (package,) = find_spec("ziamath").submodule_search_locations
+    files.append(File.generated(config, f"theme/{_FONT}", abs_src_path=f"{package}/fonts/{_FONT}"))
 
 
 def on_page_content(content: str, **_: Any) -> str:
