@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from marl_encircle import files, locks
-from marl_encircle.cli import configs, info, machine, results, runs, sweeps, tensorboard, watching
+from marl_encircle.cli import configs, info, machine, playing, results, runs, sweeps, tensorboard, watching
 from marl_encircle.experiments.yaml_files import ConfigError
 
 app = typer.Typer(
@@ -51,6 +51,14 @@ _add("train", runs.train_command, ONE, "--pursuers 3 --obstacles 1", "--reward m
 _add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --episodes 1000 --seed 77 --json")
 _add("watch", watching.watch, ONE, "ours --pursuers 3 --obstacles 1", "ours --versus model_b --save round.gif")
 _add("export", runs.export, ONE, RUN, f"{RUN} --to torchscript --out pursuers.pt --json")
+_add(
+    "play-with",
+    playing.play_with_command,
+    ONE,
+    "mpe2.simple_spread_v3 --set continuous_actions=true",
+    "mpe2.simple_tag_v3 --set continuous_actions=true --pad --algorithm matd3 --save tag",
+    "marl_encircle/encirclement-v0 --set pursuers=2 --world-steps 20000 --json",
+)
 _add("sweep", sweeps.sweep_command, MANY, "committed --jobs 2", "smoke --out trial/runs --json")
 _add("calibrate", sweeps.calibrate_command, MANY, "--jobs 2")
 _add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --jobs 2", "--grid smoke --out trial --json")
@@ -108,11 +116,12 @@ def _exit_code(error: Exception) -> int | None:
     # These modules take seconds to import; what they raise comes from there.
     from marl_encircle.core.simulator import PlacementError
     from marl_encircle.experiments.callbacks import Stopped
+    from marl_encircle.experiments.divergence import Diverged
     from marl_encircle.experiments.export import ParityError
     from marl_encircle.study.calibrate import CalibrationError
 
     if isinstance(error, PlacementError):
         return 2
-    if isinstance(error, (CalibrationError, ParityError)):
+    if isinstance(error, (CalibrationError, Diverged, ParityError)):
         return 1
     return 128 + error.signum if isinstance(error, Stopped) else None

@@ -127,6 +127,8 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     )
     if arguments[0] == "train":
         arguments += tiny_arguments("--out", "elsewhere")
+    if arguments[0] == "play-with":
+        arguments += ["--world-steps", "200", "--rounds", "5"]
     if arguments[0] == "verify-results":
         assert checkout("reproduce-tables", "--grid", "smoke").code == 0
     done = checkout(*arguments)
