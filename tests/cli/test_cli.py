@@ -27,7 +27,7 @@ from tiny_runs import (
 
 from marl_encircle import cli, files, locks
 from marl_encircle.cli import kinds, machine
-from marl_encircle.experiments import executors, train
+from marl_encircle.experiments import executors, export, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
 from marl_encircle.experiments.config import load_config
@@ -56,6 +56,20 @@ def test_train_prints_its_folder_last_and_finishes_once(run: Run, runs: Path) ->
     assert (again.code, again.out, again.err) == (0, f"{folder}\n", "already finished\n")
 
 
+def test_train_as_json_is_one_object(run: Run, runs: Path) -> None:
+    arguments = ("train", *tiny_arguments("--out", str(runs), "--quiet", "--no-tensorboard"), "--json")
+    done = run(*arguments)
+    found = json.loads(done.out)
+    folder = runs / "ours" / "ratio1.1_n3_m1_random" / "seed0"
+    rounds = json.loads(run("evaluate", folder, "--json").out)
+    assert (found["folder"], found["status"], found["world_steps"]) == (str(folder), "finished", 400)
+    assert found["success"] == rounds["success"] > 0
+    assert found["mean_episode_length"] == rounds["mean_episode_length"]
+    assert json.loads(run(*arguments).out) == found
+    (folder / "episodes.csv").write_text("edited")
+    assert run(*arguments).code == 3
+
+
 def test_train_refuses_a_folder_of_another_configuration_with_the_difference(run: Run, runs: Path) -> None:
     folder = copy_of_finished(runs)
     before = everything_in(runs)
@@ -75,6 +89,9 @@ def test_a_diverged_training_prints_its_folder_and_fails(run: Run, runs: Path, m
         folder = Path(done.out.splitlines()[-1])
         assert json.loads((folder / "run.json").read_text())["status"] == "diverged"
         assert "diverged" in done.err
+    done = run(*arguments, "--json")
+    found = json.loads(done.out)
+    assert (done.code, found["folder"], found["status"], found["success"]) == (1, str(folder), "diverged", None)
 
 
 @pytest.mark.parametrize(
@@ -376,6 +393,28 @@ def test_figures_without_matplotlib_end_with_2_and_what_to_install(
     assert everything_in(tmp_path) == before
 
 
+def test_an_unknown_layer_ends_with_2_and_the_nearest_name(run: Run) -> None:
+    done = run("watch", "--hide", "lenses")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "error: --hide lenses: unknown layer; did you mean lens?\n"
+
+
+def test_export_without_its_libraries_ends_with_2_and_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    done = run("export", finished())
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "error: ONNX needs onnxscript: pip install 'marl-encircle[export]'\n"
+    assert everything_in(Path()) == []
+
+
+def test_actors_that_act_otherwise_end_with_1_and_no_file(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export, "TOLERANCE", -1.0)
+    done = run("export", finished(), "--to", "torchscript")
+    assert (done.code, done.out) == (1, "")
+    assert done.err.startswith("error: ours_ratio1.1_n3_m1_random_seed0.pt: not written: an action differs")
+    assert everything_in(Path()) == []
+
+
 def test_verification_of_nothing_ends_with_3(run: Run, tmp_path: Path) -> None:
     done = run("verify-results", "--grid", "smoke", "--out", tmp_path, "--quiet")
     assert (done.code, done.out) == (3, "")
@@ -450,6 +489,20 @@ def test_reproduce_tables_ends_with_its_counts(run: Run, tmp_path: Path) -> None
     for damaged in (run("tables", "--grid", "smoke", "--out", results), run(*arguments)):
         assert damaged.code == 3
         assert "episodes.csv: changed since it was written" in damaged.err
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp_path: Path) -> None:
+    results = ("--grid", "smoke", "--out", tmp_path / "results")
+    done = run("reproduce-tables", *results, "--json")
+    expected = {"trained": 2, "evaluated": 0, "reused": 0, "failed": 0, "diverged": 0}
+    assert (done.code, json.loads(done.out)) == (0, expected)
+    found = json.loads(run("verify-results", *results, "--quiet", "--json").out)
+    expected = {"passed": True, "rounds": 16, "equal": 16, "cells_off": 0, "exact": True, "changed": []}
+    assert found == expected
+    (tmp_path / "results" / "tables" / "table2.md").write_text("edited")
+    done = run("verify-results", *results, "--quiet", "--json")
+    assert (done.code, json.loads(done.out)) == (3, {**expected, "passed": False, "changed": ["tables/table2.md"]})
 
 
 @pytest.mark.usefixtures("_tiny_workers")
