@@ -311,7 +311,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _check_regular(path: Path) -> None:
-    """Refuse a pipe, a device or a link that leads nowhere: reading one may never end. What is missing is told later."""
+    """Refuse a pipe, a device or a link that leads nowhere: reading one may never end. A missing file is told later."""
     if not path.is_file() and (path.exists() or path.is_symlink()):
         raise files.DamagedFileError(path, "not a regular file")
 
