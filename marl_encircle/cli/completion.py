@@ -5,17 +5,13 @@ from collections.abc import Callable
 from marl_encircle.experiments.library import Kind, files_of
 
 
-def names_of(*kinds: Kind) -> Callable[[str], list[str]]:
-    """Return what completes the names of files of these kinds."""
-
-    def complete(incomplete: str) -> list[str]:
-        return [name for kind in kinds for name in files_of(kind) if name.startswith(incomplete)]
-
-    return complete
+def names_of(*kinds: Kind) -> Callable[[], list[str]]:
+    """Return what tells the names of files of these kinds; typer leaves out those that do not fit."""
+    return lambda: [name for kind in kinds for name in files_of(kind)]
 
 
-def scenes(incomplete: str) -> list[str]:
-    """Return the scenes whose names begin so."""
+def scenes() -> list[str]:
+    """Return the names of the scenes."""
     from marl_encircle.core.scenes import SCENES
 
-    return [name for name in SCENES if name.startswith(incomplete)]
+    return list(SCENES)

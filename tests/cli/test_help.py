@@ -68,7 +68,8 @@ def test_one_thread_is_all_that_torch_gets(tmp_path: Path) -> None:
         "import torch\nfrom marl_encircle.cli import configs\nopen('threads', 'w').write(str(torch.get_num_threads()))"
     )
     (tmp_path / "sitecustomize.py").write_text("import atexit\natexit.register(lambda: exec(" + repr(code) + "))")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    path = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    environment = {**os.environ, "PYTHONPATH": path}
     environment.pop("OMP_NUM_THREADS")
     subprocess.run(
         [sys.executable, "-m", "marl_encircle", "config", "show"],
