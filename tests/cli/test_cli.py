@@ -400,10 +400,10 @@ def test_an_unknown_layer_ends_with_2_and_the_nearest_name(run: Run) -> None:
 
 
 def test_export_without_its_libraries_ends_with_2_and_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    monkeypatch.setitem(sys.modules, "onnx", None)
     done = run("export", finished())
     assert (done.code, done.out) == (2, "")
-    assert done.err == "error: ONNX needs onnxscript: pip install 'marl-encircle[export]'\n"
+    assert done.err == "error: ONNX needs onnx: pip install 'marl-encircle[export]'\n"
     assert everything_in(Path()) == []
 
 

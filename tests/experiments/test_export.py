@@ -133,8 +133,8 @@ def test_a_file_has_a_name_of_its_own_in_the_working_folder(monkeypatch: pytest.
 
 
 def test_onnx_without_its_libraries_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    pattern = r"ONNX needs onnxruntime: pip install 'marl-encircle\[export\]'"
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    pattern = r"ONNX needs onnx: pip install 'marl-encircle\[export\]'"
     with pytest.raises(ConfigError, match=pattern):
         export_run(finished(), "onnx", tmp_path / "actors.onnx")
     assert everything_in(tmp_path) == []
