@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from marl_encircle import files, locks
-from marl_encircle.cli import configs, info, machine, playing, results, runs, sweeps, tensorboard, watching
+from marl_encircle.cli import configs, info, machine, playing, results, runs, sweeps, tensorboard, tuning, watching
 from marl_encircle.experiments.yaml_files import ConfigError
 
 app = typer.Typer(
@@ -61,6 +61,7 @@ _add(
 )
 _add("sweep", sweeps.sweep_command, MANY, "committed --jobs 2", "smoke --out trial/runs --json")
 _add("calibrate", sweeps.calibrate_command, MANY, "--jobs 2")
+_add("tune", tuning.tune_command, MANY, "--trials 30 --jobs 2", "my_search.yaml --out trial/search --json")
 _add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --jobs 2", "--grid smoke --out trial --json")
 _add("tables", results.tables, STUDY, "--grid committed")
 _add("figures", results.figures, STUDY, "--grid committed")

@@ -29,7 +29,7 @@ from marl_encircle.experiments.yaml_files import ConfigError
 if TYPE_CHECKING:
     from marl_encircle.experiments.config import Config
 
-ANY = names_of("reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol")
+ANY = names_of("reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol", "tuning")
 KindOption = Annotated[
     Kind | None, typer.Option(metavar="KIND", help="What it is, where that is not clear.", show_default="found out")
 ]
@@ -96,7 +96,8 @@ def validate(
 ) -> None:
     """Check a YAML file of any kind: print 'valid' and its kind, or what is wrong with it (exit code 2).
 
-    It may be a method (reward), a scenario, an algorithm, a training, an evaluation, a grid or a protocol.
+    It may be a method (reward), a scenario, an algorithm, a training, an evaluation, a grid, a protocol or a search
+    (tuning).
     """
     from marl_encircle.cli.kinds import check, find_kinds
 

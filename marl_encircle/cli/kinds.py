@@ -19,6 +19,7 @@ from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import GridConfig, load_grid
 from marl_encircle.experiments.library import Kind, files_of, find_file, is_path, load_section
 from marl_encircle.experiments.records import run_path
+from marl_encircle.experiments.search_space import SearchFile, load_space
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.spelling import nearest
 from marl_encircle.study.calibrate import Protocol, load_protocol
@@ -33,6 +34,7 @@ KEYS: Mapping[Kind, Collection[str]] = {
     "evaluation": EvaluationConfig.model_fields,
     "grid": GridConfig.model_fields,
     "protocol": Protocol.model_fields,
+    "tuning": SearchFile.model_fields,
 }
 """What may stand in a file of each kind, beside ``base``."""
 
@@ -108,4 +110,5 @@ _CHECKS: Mapping[Kind, Callable[[str], dict[str, Any]]] = {
     "evaluation": _section("evaluation", EvaluationConfig),
     "grid": _grid,
     "protocol": lambda name: load_protocol(name).model_dump(),
+    "tuning": lambda name: load_space(name).to_dict(),
 }

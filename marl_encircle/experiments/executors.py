@@ -23,6 +23,16 @@ class Worker(Protocol):
         """Return None while it works, then a number, negative if it was killed: what it did is in the run folder."""
 
 
+class Process(Worker, Protocol):
+    """A worker of this machine, which can be ended at once."""
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+
+    def wait(self) -> int:
+        """Wait for its end."""
+
+
 class Executor(Protocol):
     """Starts workers inside its ``with`` block; at its end those still at work write their checkpoints and end."""
 
@@ -48,7 +58,7 @@ class LocalExecutor:
     def __enter__(self) -> Self:
         return self
 
-    def start(self, job: Job, out: str | Path) -> Worker:
+    def start(self, job: Job, out: str | Path) -> Process:
         """Train a job by the ``train`` command."""
         worker = _start(job, out)
         self._workers.append(worker)

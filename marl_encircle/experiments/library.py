@@ -14,7 +14,7 @@ from marl_encircle.spelling import nearest
 
 PACKAGE = Path(__file__).parent.parent
 
-Kind = Literal["reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol"]
+Kind = Literal["reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol", "tuning"]
 """What a YAML file of ours may be: a section of a configuration, or a plan of many runs."""
 
 PROTOCOLS = ("calibration",)

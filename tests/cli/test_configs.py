@@ -59,6 +59,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
 
 SETTINGS = "settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]"
 GRID = "profile: smoke\nshared: []\ngroups: "
+SEARCH = "profile: smoke\nsetting: {speed_ratio: 1.1, pursuers: 3, obstacles: 1}\nseeds: [950]\nlast_points: 1\n"
 PROTOCOL = "reward: ours\nprofile: smoke\nscenario: default\nseeds: [1]\ncombinations: 0\n"
 KINDS = {
     "reward": ("base: ours\nterms: {contraction: 2.0}", "base: ours\nterm: {}", "term: unknown key"),
@@ -71,6 +72,11 @@ KINDS = {
         PROTOCOL + f"{SETTINGS}\nneighbours: [{{acceleration: 3}}]",
         PROTOCOL + "settings: []\nneighbours: []",
         "settings: ",
+    ),
+    "tuning": (
+        SEARCH + "search: {algorithm: {gamma: {low: 0.8, high: 0.9}}}",
+        SEARCH + "search: {algorithm: {gama: {low: 0.8, high: 0.9}}}",
+        "gama: unknown key; did you mean gamma?",
     ),
 }
 

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
+from search_files import search_file
 from tiny_runs import TINY, Done, copy_of_finished, tiny, tiny_arguments, train_in_this_process
 
 from marl_encircle import cli
@@ -126,6 +127,10 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     arguments = shlex.split(
         example.replace("--grid committed", "--grid smoke").replace("sweep committed", "sweep smoke")
     )
+    if arguments[0] == "tune":
+        pytest.importorskip("optuna")
+        search_file(Path.cwd()).rename("my_search.yaml")
+        arguments += ["--trials", "1"]
     if arguments[0] == "train":
         arguments += tiny_arguments("--out", "elsewhere")
     if arguments[0] == "export" and "--to" not in arguments:
@@ -161,6 +166,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
         ("sweep ", ["all", "committed", "smoke"]),
         ("tables --grid s", ["smoke"]),
         ("calibrate ", ["calibration"]),
+        ("tune ", ["default"]),
         ("config validate p", ["paper"]),
         ("config diff ours o", ["ours"]),
         ("train --reward ablations/", []),  # the shell goes on with files
