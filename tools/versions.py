@@ -19,7 +19,6 @@ TESTS = (
     "core",
     "envs",
     "maddpg",
-    "cli/test_help.py",
     "cli/test_configs.py",
     "experiments/test_config.py",
     "test_files.py",
