@@ -179,7 +179,9 @@ ALLOWED = {
     "experiments/build.py": ["save"],  # to bytes
     "experiments/checkpoint.py": ["replace"],  # a damaged checkpoint is put aside
     "experiments/export.py": ["save", "save"],  # to bytes
-    "experiments/tensorboard.py": ["SummaryWriter", "mkdir", "symlink_to"],  # what TensorBoard shows of finished runs
+    "experiments/callbacks.py": ["dump"],  # to the logger
+    "experiments/tensorboard.py": ["SummaryWriter", "mkdir", "symlink_to", "unlink"],  # what TensorBoard shows
+    "experiments/trials.py": ["dump"],  # to a text
     "replays/film.py": ["get_writer", "save", "save"],  # to a path of `atomic_path`, to bytes
     "study/figures/canvas.py": ["savefig"],  # to bytes
     "study/reproduce.py": ["unlink"],  # a table that there is no run for any more

@@ -67,6 +67,7 @@ def _pieces(text: str) -> list[tuple[bool, str]]:
 def font(size: int, bold: bool = False) -> Any:
     """Return the letters of the figures, which come with Matplotlib; pygame's own where that is missing."""
     pygame.font.init()
+    pygame.register_quit(font.cache_clear)  # another environment may end pygame when it is closed
     matplotlib = importlib.util.find_spec("matplotlib")
     if matplotlib is None or matplotlib.origin is None:
         return pygame.font.Font(None, round(1.2 * size))

@@ -301,3 +301,11 @@ def test_pygame_does_not_advertise() -> None:
         [sys.executable, "-c", "import marl_encircle.envs.render"], capture_output=True, text=True, check=True
     )
     assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_it_draws_on_after_another_environment_ended_pygame() -> None:
+    before = pen.font(24)
+    pygame.quit()
+    after = pen.font(24)
+    assert after is not before
+    assert after.render("text", True, "black").get_width() > 0

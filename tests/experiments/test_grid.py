@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from marl_encircle import cli
-from marl_encircle.cli import runs
+from marl_encircle.experiments import train as training
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.grid import Grid, Job, arguments, load_grid
 from marl_encircle.experiments.records import Cell, Setting
@@ -232,7 +232,7 @@ def test_a_job_on_the_command_line_is_the_same_run(monkeypatch: pytest.MonkeyPat
         trained.append((config, seed))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(runs, "train", note)
+    monkeypatch.setattr(training, "train", note)
     job = Job("model_c", Setting(1.25, 4, 2, "concave"), 17, "smoke")
     CliRunner().invoke(cli.app, ["train", *arguments(job), "--out", str(tmp_path)])
     assert trained == [(job.config, 17)]
