@@ -1,11 +1,14 @@
 """A command whose disk fails says so in one line, ends with 1, and leaves what the same command goes on from."""
 
 import itertools
+import threading
 from pathlib import Path
 
 import pytest
-from faults import ERRNOS, failing_disk, temporary_files
-from tiny_runs import command, contents, finished, tiny_arguments
+from faults import ERRNOS, failing_disk, largest_file, temporary_files
+from tiny_runs import command, contents, finished, tiny, tiny_arguments
+
+from marl_encircle.experiments.tensorboard import EventFiles
 
 RUN = Path(*finished().parts[-3:])
 
@@ -52,3 +55,28 @@ def test_a_failing_call_ends_the_command_with_1_and_its_repetition_with_0(
         if not fault.struck:
             break
     assert failed > 3
+
+
+def test_event_files_that_find_no_room_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["train", *tiny_arguments("--out", str(tmp_path), "--quiet")]
+    with largest_file(2000):
+        done = command(capsys, monkeypatch, *arguments)
+    assert done == (1, "", f"error: [Errno 27] not saved: File too large: '{tmp_path / RUN / 'tensorboard'}'\n")
+    assert command(capsys, monkeypatch, *arguments).code == 0
+    assert contents(tmp_path / RUN) == contents(finished())
+
+
+def test_a_log_that_finds_no_room_names_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)  # the command does so too
+    events = EventFiles(tmp_path / "events", tiny(), 0, 0)
+
+    def write_for_ever() -> None:
+        for step in itertools.count():
+            events.write({"x": 1.0}, {"x": ()}, step)
+
+    for action in (write_for_ever, events.close):
+        with largest_file(8000), pytest.raises(OSError, match="not saved: File too large") as caught:
+            action()
+        assert caught.value.filename == str(tmp_path / "events")

@@ -6,7 +6,9 @@ signal n.
 
 import os
 import re
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from inspect import cleandoc
 from typing import Annotated
@@ -97,13 +99,30 @@ def _options(
 def main() -> None:
     """Run the command; errors become one message and an exit code."""
     try:
-        app()
+        with _one_telling():
+            app()
     except Exception as error:
         code = _exit_code(error)
         if code is None or os.environ.get("MARL_ENCIRCLE_DEBUG"):
             raise
         typer.echo(str(error) if code > 128 else f"error: {error}", err=True)
         raise SystemExit(code) from None
+
+
+@contextmanager
+def _one_telling() -> Iterator[None]:
+    """Say nothing of an error in TensorBoard's writing thread, which hands it to the main one."""
+    usual = threading.excepthook
+
+    def say(failed: threading.ExceptHookArgs) -> None:
+        if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
+            usual(failed)
+
+    threading.excepthook = say
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 def _exit_code(error: Exception) -> int | None:

@@ -5,8 +5,10 @@ selection rounds, which are never reported.
 """
 
 import csv
+import errno
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,21 +73,32 @@ class EventFiles(TensorBoardOutputFormat):
     def __init__(self, folder: Path, config: Config, seed: int, steps: int, draw: Draw | None = None) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
+        self.config, self.draw, self.folder = config, draw, folder
         earlier = list(folder.glob("events.out.tfevents.*"))
         if steps == 0:  # the training starts over
             for path in earlier:
                 path.unlink()
-        super().__init__(str(folder))
-        self.config, self.draw = config, draw
-        if earlier and steps:
-            # The last point comes after the last checkpoint, at the same step.
-            is_trained = steps >= config.training.world_steps * config.scenario.pursuers
-            first = steps if is_trained else steps + 1
-            writer: Any = self.writer.file_writer
-            writer.add_event(Event(file_version="brain.Event:2"), first)
-            writer.add_event(Event(session_log=SessionLog(status=SessionLog.START)), first)
-        else:
-            describe(self.writer, config, seed)
+        with _named(folder):
+            super().__init__(str(folder))
+            if earlier and steps:
+                # The last point comes after the last checkpoint, at the same step.
+                is_trained = steps >= config.training.world_steps * config.scenario.pursuers
+                first = steps if is_trained else steps + 1
+                writer: Any = self.writer.file_writer
+                writer.add_event(Event(file_version="brain.Event:2"), first)
+                writer.add_event(Event(session_log=SessionLog(status=SessionLog.START)), first)
+            else:
+                describe(self.writer, config, seed)
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Write a log."""
+        with _named(self.folder):
+            super().write(key_values, key_excluded, step)
+
+    def close(self) -> None:
+        """Write what waits."""
+        with _named(self.folder):
+            super().close()
 
     def add_pictures(self, policy: MADDPGPolicy, point: int, steps: int) -> None:
         """Draw the rounds of a policy if it is time to.
@@ -95,9 +108,20 @@ class EventFiles(TensorBoardOutputFormat):
         """
         if self.draw is None or not is_drawn(self.config, point):
             return
-        for picture in self.draw(policy, self.config):
-            add_picture(self.writer, picture, steps)
-        self.writer.flush()
+        pictures = self.draw(policy, self.config)
+        with _named(self.folder):
+            for picture in pictures:
+                add_picture(self.writer, picture, steps)
+            self.writer.flush()
+
+
+@contextmanager
+def _named(folder: Path) -> Iterator[None]:
+    """Have errors of the disk name the folder: TensorBoard hands on those of its writing thread, which name nothing."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno or errno.EIO, f"not saved: {error.strerror or error}", str(folder)) from error
 
 
 def is_drawn(config: Config, point: int) -> bool:
