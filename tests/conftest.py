@@ -5,6 +5,8 @@ kind or by the number of steps, are deselected then, and arithmetic on scalars w
 """
 
 import os
+import sys
+from collections.abc import Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"  # libraries read it when they are imported
 
@@ -22,6 +24,15 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 if numba.config.DISABLE_JIT:
     np.seterr(divide="ignore", invalid="ignore", over="ignore")
+
+
+@pytest.fixture(autouse=True)
+def _configurations_of_its_own() -> Iterator[None]:
+    """Forget the configurations of a test's jobs: it may have made them tiny."""
+    yield
+    grid = sys.modules.get("marl_encircle.experiments.grid")
+    if grid is not None:
+        grid._config.cache_clear()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

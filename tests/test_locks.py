@@ -66,9 +66,8 @@ def test_one_process_cannot_hold_a_folder_twice_and_can_take_it_again(tmp_path: 
 HOLD_LOCK_AND_FORK = """
 import os, time
 with locks["folder_lock"](sys.argv[2]):
-    child = os.fork()
-    if child:
-        print(child, flush=True)
+    if os.fork() == 0:  # the child tells of itself when it is done with what a fork does
+        print(os.getpid(), flush=True)
     time.sleep(60)
 """
 
