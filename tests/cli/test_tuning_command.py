@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from search_files import search_file
-from tiny_runs import Done, Trained, everything_in, train_in_this_process
+from tiny_runs import TINY, Done, Trained, everything_in, train_in_this_process
 
 from marl_encircle.experiments import executors
 from marl_encircle.experiments.config import load_config
@@ -99,13 +99,14 @@ def test_a_search_without_optuna_ends_with_2_and_names_the_extra(
 
 @pytest.mark.slow
 def test_a_search_in_processes_stops_cleanly_and_goes_on(run: Run, tmp_path: Path) -> None:
-    """Trainings of half a minute are stopped in their midst; shorter ones would be over first."""
-    changes = ("training.world_steps=6000", "training.curve_every=100", "training.n_worlds=4")
-    long = search_file(tmp_path, overrides=f"[{', '.join(changes)}, evaluation.curve_episodes=4]", seeds="[950]")
+    """The training takes long enough to be stopped in its midst."""
+    longer = ("training.world_steps=3000", "training.curve_every=50")
+    overrides = ", ".join(f'"{text}"' for text in (*TINY, *longer))
+    long = search_file(tmp_path, overrides=f"[{overrides}]")
     out = tmp_path / "out"
     command = [sys.executable, "-m", "marl_encircle", "tune", long, "--trials", "1", "--out", str(out)]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=os.environ) as search:
-        curve = wait_for(out)
+        curve = wait_for(out, search)
         search.send_signal(signal.SIGTERM)
         _, said = search.communicate(timeout=60)
     assert search.returncode == 128 + signal.SIGTERM
@@ -121,12 +122,12 @@ def test_a_search_in_processes_stops_cleanly_and_goes_on(run: Run, tmp_path: Pat
     assert record["config"]["evaluation"]["seed"] != load_config().evaluation.seed
 
 
-def wait_for(out: Path) -> Path:
+def wait_for(out: Path, search: "subprocess.Popen[str]") -> Path:
     """Wait for a learning curve with a point."""
     deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
+    while time.monotonic() < deadline and search.poll() is None:
         for path in out.glob("trials/*/*/*/*/progress.csv"):
             if path.read_text().count("\n") > 1:
                 return path
         time.sleep(0.05)
-    raise AssertionError("no point of a learning curve in two minutes")
+    raise AssertionError(f"no point of a learning curve; exit code {search.poll()}")

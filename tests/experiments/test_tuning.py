@@ -2,6 +2,7 @@
 
 import csv
 import io
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from search_files import search_file
-from tiny_runs import Trained, train_in_this_process
+from tiny_runs import TINY, Trained, train_in_this_process
 
 from marl_encircle import files
 from marl_encircle.experiments import checkpoint, executors
@@ -20,7 +21,7 @@ from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.search_space import Space, load_space
 from marl_encircle.experiments.train import OtherRunError, run_folder
-from marl_encircle.experiments.trials import Row
+from marl_encircle.experiments.trials import Outcome, Row
 from marl_encircle.experiments.tuning import tune
 from marl_encircle.experiments.yaml_files import ConfigError
 
@@ -32,11 +33,40 @@ SEARCH = (
 )
 
 
+SEEDS = "[950, 951]"
+EASY = [*TINY, "scenario.movement_range_limit=8.0", "evaluation.curve_episodes=20"]
+"""In which beginners succeed now and then."""
+
+
+def tiny_search(folder: Path, **changes: str) -> Space:
+    overrides = "[" + ", ".join(f'"{text}"' for text in EASY) + "]"
+    return load_space(search_file(folder, **{"seeds": SEEDS, "search": SEARCH, "overrides": overrides, **changes}))
+
+
 @pytest.fixture
 def space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Space:
     """A search with two seeds of a tiny training, in this process."""
     train_in_this_process(monkeypatch)
-    return load_space(search_file(tmp_path, seeds="[950, 951]", search=SEARCH, random_trials="2"))
+    return tiny_search(tmp_path)
+
+
+class Found(NamedTuple):
+    """A search of two trials that was not stopped, to be read only."""
+
+    space: Space
+    out: Path
+    outcome: Outcome
+    told: list[Row]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
+    folder = tmp_path_factory.mktemp("found")
+    told: list[Row] = []
+    with pytest.MonkeyPatch.context() as patch:
+        train_in_this_process(patch)
+        space = tiny_search(folder)
+        return Found(space, folder / "out", tune(space, folder / "out", 2, 1, told.append), told)
 
 
 def curve(folder: Path) -> list[float]:
@@ -75,44 +105,39 @@ class Scripted:
         return -9
 
 
-def test_trials_are_worth_the_last_points_of_their_curves(space: Space, tmp_path: Path) -> None:
-    told: list[Row] = []
-    outcome = tune(space, tmp_path / "out", 3, 1, told.append)
-    assert [row.number for row in outcome.rows] == [0, 1, 2]
-    assert outcome.rows[0].values == space.base, "the values in use come first"
-    assert told == outcome.rows
-    for row in outcome.rows:
-        folders = [run_folder(job.config, job.seed, tmp_path / "out" / "trials" / f"{row.number:04}")
-                   for job in space.jobs(row.values)]  # fmt: skip
-        assert row.success == pytest.approx(mean(mean(curve(folder)[-2:]) for folder in folders))
+def test_trials_are_worth_the_last_points_of_their_curves(found: Found) -> None:
+    rows = found.outcome.rows
+    assert [row.number for row in rows] == [0, 1]
+    assert rows[0].values == found.space.base, "the values in use come first"
+    assert found.told == rows
+    for row in rows:
+        folder = found.out / "trials" / f"{row.number:04}"
+        curves = [curve(run_folder(job.config, job.seed, folder)) for job in found.space.jobs(row.values)]
+        assert row.success == pytest.approx(mean(mean(each[-2:]) for each in curves))
         assert (row.state, row.points) == ("complete", 4)
-    assert outcome.best == max(outcome.rows, key=lambda row: row.success or 0)
+    assert found.outcome.best == max(rows, key=lambda row: row.success or 0.0)
+    assert rows[0].success != rows[1].success, "else little was compared"
 
 
-def test_the_table_has_every_trial(space: Space, tmp_path: Path) -> None:
-    outcome = tune(space, tmp_path / "out", 2, 1)
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "out" / "trials.csv").read_text())))
-    assert list(rows[0]) == ["trial", "state", "success", "points", *space.dimensions]
+def test_the_table_has_every_trial(found: Found) -> None:
+    rows = list(csv.DictReader(io.StringIO((found.out / "trials.csv").read_text())))
+    assert list(rows[0]) == ["trial", "state", "success", "points", *found.space.dimensions]
     assert [(row["trial"], row["state"], float(row["success"])) for row in rows] == [
-        (str(row.number), "complete", row.success) for row in outcome.rows
+        (str(row.number), "complete", row.success) for row in found.outcome.rows
     ]
     assert rows[0]["algorithm.net_arch"] == "[16]"
 
 
-def test_the_best_trial_is_what_train_gets(space: Space, tmp_path: Path) -> None:
-    outcome = tune(space, tmp_path / "out", 2, 1)
-    assert outcome.best is not None
-    tried = space.jobs(outcome.best.values)[0].config
-    rest = [text for text in space.file.overrides if not text.startswith("algorithm.")]
-    best = load_config(
-        outcome.written["reward"], algorithm=outcome.written["algorithm"], profile="smoke", overrides=rest
-    )
-    assert (best.algorithm, best.scenario, best.training) == (tried.algorithm, tried.scenario, tried.training)
-    assert best.reward.name == "ours_tuned"
-    assert best.reward.model_copy(update={"name": "ours"}) == tried.reward
-    assert outcome.written == {
-        "algorithm": tmp_path / "out" / "best.yaml", "reward": tmp_path / "out" / "best_reward.yaml"
-    }  # fmt: skip
+def test_the_best_trial_is_what_train_gets(found: Found) -> None:
+    best, written = found.outcome.best, found.outcome.written
+    assert best is not None
+    assert written == {"algorithm": found.out / "best.yaml", "reward": found.out / "best_reward.yaml"}
+    tried = found.space.jobs(best.values)[0].config
+    rest = [text for text in found.space.file.overrides if not text.startswith("algorithm.")]
+    config = load_config(written["reward"], algorithm=written["algorithm"], profile="smoke", overrides=rest)
+    assert (config.algorithm, config.scenario, config.training) == (tried.algorithm, tried.scenario, tried.training)
+    assert config.reward.name == "ours_tuned"
+    assert config.reward.model_copy(update={"name": "ours"}) == tried.reward
 
 
 def test_a_base_of_ones_own_is_found_from_the_best_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,52 +145,47 @@ def test_a_base_of_ones_own_is_found_from_the_best_file(tmp_path: Path, monkeypa
     (tmp_path / "mine.yaml").write_text("base: maddpg\ngamma: 0.8\n")
     monkeypatch.chdir(tmp_path)
     search_file(tmp_path, algorithm="mine.yaml")
-    outcome = tune(load_space("./search.yaml"), "results/deep/out", 1, 1)
+    outcome = tune(load_space("search.yaml"), "results/deep/out", 1, 1)
     assert list(outcome.written) == ["algorithm"]
     assert load_config(algorithm=outcome.written["algorithm"]).algorithm.gamma == 0.8
 
 
-def test_more_trials_go_on_as_if_there_had_been_no_stop(space: Space, tmp_path: Path) -> None:
-    at_once = tune(space, tmp_path / "at once", 5, 1)
-    for n_trials in (2, 2, 5):
-        in_parts = tune(space, tmp_path / "in parts", n_trials, 1)
-    assert in_parts.rows == at_once.rows
-    assert len({str(row.values) for row in at_once.rows}) == 5
+def test_more_trials_go_on_as_if_there_had_been_no_stop(space: Space, found: Found, tmp_path: Path) -> None:
+    for n_trials in (1, 1, 2):
+        outcome = tune(space, tmp_path / "out", n_trials, 1)
+        assert len(outcome.rows) == n_trials
+    assert outcome.rows == found.outcome.rows
 
 
-@pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_a_search_that_is_stopped_goes_on_with_its_trial(
-    space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+def test_a_search_that_is_stopped_anywhere_goes_on_with_its_trial(
+    space: Space, found: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two trials of two trainings; the search ends in the next one."""
-    at_once = tune(space, tmp_path / "at once", 2, 1)
-    trained: list[tuple[int, str]] = []
+    trained: list[tuple[str, int]] = []
+    stops = list(range(4))
 
     def start(job: Job, out: Path) -> Trained:
-        if len(trained) == after:
+        if stops and len(trained) == stops[0]:
+            del stops[0]
             raise Stopped(15)
-        trained.append((job.seed, out.name))
+        trained.append((out.name, job.seed))
         return Trained(job, out)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(executors, "_start", start)
+    monkeypatch.setattr(executors, "_start", start)
+    while stops:
         with pytest.raises(Stopped):
-            tune(space, tmp_path / "stopped", 2, 1)
-        after = 99
-        resumed = tune(space, tmp_path / "stopped", 2, 1)
-    assert resumed.rows == at_once.rows
-    assert trained == [(950, "0000"), (951, "0000"), (950, "0001"), (951, "0001")], "each once"
+            tune(space, tmp_path / "out", 2, 1)
+    assert tune(space, tmp_path / "out", 2, 1).rows == found.outcome.rows
+    assert trained == [("0000", 950), ("0000", 951), ("0001", 950), ("0001", 951)], "each once"
 
 
-def test_another_search_in_the_folder_is_refused_with_the_difference(space: Space, tmp_path: Path) -> None:
-    tune(space, tmp_path / "out", 1, 1)
-    before = (tmp_path / "out" / "trials.csv").read_bytes()
-    other = load_space(search_file(tmp_path, seeds="[950, 952]", search=SEARCH, random_trials="2"))
-    with pytest.raises(
-        OtherRunError, match=r"holds another search; .*\n  seeds: \[950, 952\] here, \[950, 951\] there"
-    ):
-        tune(other, tmp_path / "out", 2, 1)
-    assert (tmp_path / "out" / "trials.csv").read_bytes() == before
+def test_another_search_in_the_folder_is_refused_with_the_difference(found: Found, tmp_path: Path) -> None:
+    out = shutil.copytree(found.out, tmp_path / "out")
+    before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    other = tiny_search(tmp_path, seeds="[950, 952]")
+    line = r"\n  seeds: \[950, 952\] here, \[950, 951\] there$"
+    with pytest.raises(OtherRunError, match=f"out already holds another search; choose another folder:{line}"):
+        tune(other, out, 3, 1)
+    assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
 
 
 # pruning
@@ -193,7 +213,7 @@ def judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Jud
             return worker
 
         monkeypatch.setattr(executors, "_start", start)
-        space = load_space(search_file(tmp_path, seeds="[950, 951]", search=SEARCH, pruning=pruning))
+        space = tiny_search(tmp_path, pruning=pruning)
         judged.rows.extend(tune(space, tmp_path / "out", 3, n_workers).rows)
         assert [(row.state, row.success) for row in judged.rows[:2]] == [("complete", 0.5)] * 2
         return judged
