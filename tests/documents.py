@@ -35,10 +35,11 @@ NOT_RUN = {
     "make test": "runs this test",
     "make check": "other tools, which CI runs",
     "make soak": "takes longer than all tests",
-    "tensorboard ": "serves until it is stopped",
+    "marl-encircle tensorboard": "serves until it is stopped; tests/cli/test_tensorboard_command.py has one",
     "pip install ": "installs elsewhere",
     "ray start ": "starts a cluster; tests/experiments/test_ray_executor.py has one",
     "marl-encircle sweep all --jobs 64 --executor ray": "needs that cluster",
+    "marl-encircle tune ": "trains for hours; tests/experiments/test_tuning.py has small ones",
 }
 """Beginnings of the commands that are not run, and why."""
 

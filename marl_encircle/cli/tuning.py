@@ -73,7 +73,8 @@ def _as_json(outcome: "Outcome") -> dict[str, Any]:
 def _print(outcome: "Outcome", folder: Path) -> None:
     """Print the best trials, and what to do with the best."""
     names = list(dict.fromkeys(key for row in outcome.rows for key in row.values))
-    table = Table("trial", "success", "points", *names, box=box.SIMPLE_HEAD)
+    heads = [name.removeprefix("algorithm.").removeprefix("reward.").removeprefix("terms.") for name in names]
+    table = Table("trial", "success", "points", *heads, box=box.SIMPLE_HEAD)
     rows = sorted(outcome.rows, key=lambda row: (row.state == "complete", row.success or 0.0), reverse=True)
     for row in rows[:SHOWN]:
         state = "" if row.state == "complete" else f" ({row.state})"

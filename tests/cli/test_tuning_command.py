@@ -34,7 +34,7 @@ def test_it_prints_the_trials_and_the_command_that_trains_the_best(
         "trial 1: complete after 4 points",
     ]
     *table, last = done.out.splitlines()
-    assert "algorithm.learning_rate" in "".join(table)
+    assert "learning_rate" in "".join(table)
     assert last == "marl-encircle train --algorithm found/best.yaml"
     overrides = [part for text in ("training.world_steps=100", "training.curve_every=100") for part in ("--set", text)]
     trained = run(*shlex.split(last)[1:], "--profile", "smoke", *overrides, "--set", "algorithm.random_world_steps=20")
