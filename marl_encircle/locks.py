@@ -66,7 +66,8 @@ def folder_lock(folder: str | Path) -> Iterator[None]:
             with suppress(OSError):  # a folder that has vanished takes its lock along
                 path.unlink(missing_ok=True)
             _held_locks.discard(descriptor)
-            os.close(descriptor)
+            with suppress(OSError):  # it is closed then too, and nothing of worth was in it
+                os.close(descriptor)
 
 
 def _acquire(path: Path) -> int:

@@ -1,3 +1,4 @@
+import errno
 import fcntl
 import json
 import os
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from faults import fail_everywhere
 
 from marl_encircle import locks
 
@@ -110,6 +112,21 @@ def test_a_lock_that_says_nothing_readable_still_locks(tmp_path: Path, holder: s
         locks.folder_lock(tmp_path),
     ):
         pass
+
+
+def test_every_call_of_a_lock_may_fail(tmp_path: Path) -> None:
+    def check(folder: Path, error: OSError | None) -> None:
+        if error is not None:
+            assert (error.errno, error.filename) == (errno.EIO, str(folder / ".lock"))
+        with locks.folder_lock(folder):
+            pass
+
+    def lock(folder: Path) -> None:
+        with locks.folder_lock(folder):
+            pass
+
+    calls = fail_everywhere(tmp_path, lambda _: None, lock, check, errno.EIO)
+    assert calls == ["mkdir", "open", "ftruncate", "write", "unlink", "close"]
 
 
 def test_a_folder_that_cannot_be_locked_is_an_error_that_names_the_lock(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ FORMER = "checkpoint.former.safetensors"
 DAMAGED = "checkpoint.damaged.safetensors"
 ARRAY = "$array"
 COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
+MONITOR = ("episode_returns", "episode_lengths")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 logger = logging.getLogger(__name__)
@@ -130,6 +131,7 @@ def capture(model: MADDPG, curriculum: CurriculumVecEnv, *, with_replay: bool = 
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "last_obs": model._last_obs,
         "last_episode_starts": model._last_episode_starts,
+        "monitor": {name: getattr(model.env, name) for name in MONITOR},
         "replay": {name: getattr(buffer, name)[:filled] for name in REPLAY},
         "replay_position": [buffer.pos, buffer.full] if with_replay else [0, False],
         "worlds": _distinct(curriculum.venv.env_method("get_state")),
@@ -148,6 +150,8 @@ def restore(model: MADDPG, curriculum: CurriculumVecEnv, saved: Mapping[str, Any
     restore_parameters(model, saved)
     model._last_obs = saved["last_obs"]
     model._last_episode_starts = saved["last_episode_starts"]
+    for name, value in saved.get("monitor", {}).items():  # older checkpoints have none; it is only logged
+        setattr(model.env, name, value)
     buffer = model.replay_buffer
     assert buffer is not None
     for name in REPLAY:

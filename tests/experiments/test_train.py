@@ -298,6 +298,28 @@ def test_a_stopped_training_goes_on_bit_for_bit(
     assert {key for key in one if one[key] != other[key]} <= {"wall_seconds", "cpu_seconds", "git_commit"}
 
 
+def test_a_round_that_a_stop_cuts_in_two_has_its_whole_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rounds: list[tuple[int, float, int]] = []
+
+    class Notebook(train.RoundLogger):
+        def _on_step(self) -> bool:
+            ended = callbacks.ended_rounds(self, self.curriculum)
+            rounds.extend((self.num_timesteps, info["episode"]["r"], info["episode"]["l"]) for info in ended)
+            return super()._on_step()
+
+    monkeypatch.setattr(train, "RoundLogger", Notebook)
+    train.train(tiny(), 0, "native", tmp_path / "whole")
+    whole = rounds.copy()
+    rounds.clear()
+    with monkeypatch.context() as patch:
+        stop_at(patch, 50)
+        with pytest.raises(Stopped):
+            train.train(tiny(), 0, "native", tmp_path / "parts")
+    train.train(tiny(), 0, "native", tmp_path / "parts")
+    assert rounds == whole
+    assert len(whole) >= 20
+
+
 def test_a_training_may_be_stopped_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = tiny(overrides=["training.world_steps=40", "algorithm.random_world_steps=8", "training.curve_every=20"])
     whole, _ = train.train(config, 0, "native", tmp_path / "whole")
