@@ -1,5 +1,6 @@
 """The enclosure against exact arcs, against the paper's own words, and against what symmetry demands."""
 
+import itertools
 import math
 
 import numpy as np
@@ -164,6 +165,8 @@ def test_the_kernel_is_the_paper_word_by_word(closure: str, layout: Layout) -> N
 
 @given(layout=layouts(least_ratio=1.01))
 def test_sampled_angles_and_areas_converge_to_the_exact_arcs(layout: Layout) -> None:
+    # Of two bodies in one place rounding decides who is first.
+    assume(all(math.dist(a, b) > 1e-6 for a, b in itertools.combinations(layout.pursuers, 2)))
     arcs = exact(layout)
     for n_directions in (72, 4096):
         enclosure = rule(layout, n_directions=n_directions)
