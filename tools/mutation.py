@@ -14,9 +14,11 @@ import argparse
 import ast
 import hashlib
 import json
+import math
 import os
 import random
 import re
+import resource
 import shlex
 import shutil
 import subprocess
@@ -61,6 +63,13 @@ SENSELESS = re.compile(
 """Floats have no bits: such a mutant does not run."""
 
 
+FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+"""A line of pytest's summary."""
+
+WAITING = 10
+"""So many times its processor time [s] may a mutant take on the clock: one that waits for ever uses none."""
+
+
 class WorkError(Exception):
     """The work could not be done, so that nothing is known."""
 
@@ -78,12 +87,16 @@ class Result(NamedTuple):
     """What the tests made of a mutant.
 
     :param sources: hash of the module and its tests
+    :param noticed_by: the test that failed; empty if none did, or none before the limit of time
+    :param seconds: processor time [s]
     """
 
     mutant: Mutant
     sources: str
     killed: bool
     diff: str
+    noticed_by: str
+    seconds: float
 
 
 def main() -> int:
@@ -162,8 +175,8 @@ def test_all(wanted: Sequence[Mutant], jobs: int, deadline: float) -> dict[Mutan
             queue.put(copy)
         with ProcessPoolExecutor(jobs, context, _move_into, (queue,)) as pool, RESULTS.open("a") as log:
             modules = sorted({mutant.module for mutant in todo})
-            timeouts = dict(zip(modules, pool.map(timeout_of, modules), strict=True))
-            futures = [pool.submit(test, m, sources[m.module], timeouts[m.module], deadline) for m in todo]
+            limits = dict(zip(modules, pool.map(limit_of, modules), strict=True))
+            futures = [pool.submit(test, m, sources[m.module], limits[m.module], deadline) for m in todo]
             for count, future in enumerate(as_completed(futures), 1):
                 result = future.result()
                 if result is None:
@@ -171,7 +184,7 @@ def test_all(wanted: Sequence[Mutant], jobs: int, deadline: float) -> dict[Mutan
                 known[result.mutant] = result
                 log.write(json.dumps([*result.mutant, *result[1:]]) + "\n")
                 log.flush()
-                verdict = "killed" if result.killed else "SURVIVED"
+                verdict = f"killed by {result.noticed_by or 'time'}" if result.killed else "SURVIVED"
                 print(f"{count}/{len(todo)} {result.mutant.module} {result.mutant.operator} {verdict}", flush=True)
     return known
 
@@ -205,28 +218,38 @@ def tests_of(module: str) -> list[str]:
     return [f"tests/{name}" for name in TESTS.get(module, (own,))]
 
 
-def command_of(module: str) -> list[str]:
-    """Return the command that runs a module's tests up to the first failure."""
+def command_of(module: str, limit: int | None = None) -> list[str]:
+    """Return the command that runs a module's tests up to the first failure.
+
+    :param limit: processor time [s] after which a process of it is killed; unlike a clock it knows of no busy machine
+    """
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=line", "--durations=0"]
     plain = f"NUMBA_DISABLE_JIT={int(module not in COMPILED)}"
-    return ["env", plain, sys.executable, "-m", "pytest", *options, *tests_of(module)]
+    limited = [] if limit is None else ["sh", "-c", f'ulimit -t {limit} && exec "$0" "$@"']
+    return ["env", plain, *limited, sys.executable, "-m", "pytest", *options, *tests_of(module)]
 
 
-def timeout_of(module: str) -> float:
-    """Return how long [s] a module's tests may take: thrice what they take on the code as it is.
+def limit_of(module: str) -> int:
+    """Return how much processor time [s] a module's tests may take: thrice what they take on the code as it is.
 
     :raises WorkError: if they fail there
     """
-    started = time.monotonic()
+    started = processor_time()
     done = subprocess.run(command_of(module), capture_output=True, text=True, check=False)
     if done.returncode:
         raise WorkError(f"the tests of {module} fail on the code as it is:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-    seconds = time.monotonic() - started
-    print(f"{module}: its tests take {seconds:.0f} s", flush=True)
-    return 10 + 3 * seconds
+    seconds = processor_time() - started
+    print(f"{module}: its tests take {seconds:.1f} s of processor time", flush=True)
+    return 10 + math.ceil(3 * seconds)
 
 
-def test(mutant: Mutant, sources: str, timeout: float, deadline: float) -> Result | None:
+def processor_time() -> float:
+    """Return what the programs that this process started and saw end have taken [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def test(mutant: Mutant, sources: str, limit: int, deadline: float) -> Result | None:
     """Return what the tests make of a mutant, None if it is too late to begin."""
     from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.work_item import MutationSpec, TestOutcome
@@ -235,10 +258,14 @@ def test(mutant: Mutant, sources: str, timeout: float, deadline: float) -> Resul
         return None
     path = Path("marl_encircle", mutant.module)
     spec = MutationSpec(path, mutant.operator, mutant.occurrence, (1, 0), (1, 1), json.loads(mutant.arguments))
-    done = mutate_and_test([spec], shlex.join(command_of(mutant.module)), timeout)
+    started = processor_time()
+    done = mutate_and_test([spec], shlex.join(command_of(mutant.module, limit)), timeout=WAITING * limit)
     if done.diff is None:
         raise WorkError(f"{mutant} could not be made: {done.output}")
-    return Result(mutant, sources, done.test_outcome != TestOutcome.SURVIVED, done.diff)
+    failed = FAILED.search(done.output)
+    noticed_by = failed.group(1) if failed else ""
+    killed = done.test_outcome != TestOutcome.SURVIVED
+    return Result(mutant, sources, killed, done.diff, noticed_by, round(processor_time() - started, 1))
 
 
 def hash_of(module: str) -> str:
@@ -258,27 +285,33 @@ def former_results() -> Iterator[Result]:
 
 
 def report(found: dict[str, list[Mutant]], wanted: Sequence[Mutant], results: dict[Mutant, Result]) -> int:
-    """Print survivors and figures by module; return the exit code."""
+    """Print what no test noticed and figures by module; return the exit code."""
     tested = [results[mutant] for mutant in wanted if mutant in results]
     for result in tested:
-        if not result.killed:
-            print(f"\nsurvived: {result.mutant.module}, {result.mutant.operator} {result.mutant.occurrence}")
+        if not result.noticed_by:
+            what = "killed by time alone" if result.killed else "survived"
+            print(f"\n{what}: {result.mutant.module}, {result.mutant.operator} {result.mutant.occurrence}")
             print(result.diff)
-    print(f"\n{'module':<28} {'all':>6} {'tested':>7} {'killed':>7} {'survived':>9}")
+    print(f"\n{'module':<28} {'all':>6} {'tested':>7} {'killed':>7} {'by time':>8} {'survived':>9} {'minutes':>8}")
     for module, mutants in found.items():
-        own = [result for result in tested if result.mutant.module == module]
-        killed = sum(result.killed for result in own)
-        print(f"{module:<28} {len(mutants):>6} {len(own):>7} {killed:>7} {len(own) - killed:>9}")
-    killed, missing = sum(result.killed for result in tested), len(wanted) - len(tested)
-    score = killed / len(tested) if tested else 0.0
-    print(f"{'total':<28} {sum(map(len, found.values())):>6} {len(tested):>7} {killed:>7} {len(tested) - killed:>9}")
+        print_row(module, len(mutants), [result for result in tested if result.mutant.module == module])
+    print_row("total", sum(map(len, found.values())), tested)
+    score = sum(result.killed for result in tested) / len(tested) if tested else 0.0
     print(f"score: {score:.1%}; at least {LEAST_SCORE:.0%} is wanted")
     empty = [module for module in found if not any(result.mutant.module == module for result in tested)]
+    missing = len(wanted) - len(tested)
     for module in empty:
         print(f"error: no mutant of {module} was tested", file=sys.stderr)
     if missing:
         print(f"error: {missing} mutants were not tested in time; run again to go on", file=sys.stderr)
     return 1 if empty or missing or score < LEAST_SCORE else 0
+
+
+def print_row(name: str, number: int, tested: Sequence[Result]) -> None:
+    """Print how many mutants there are, were tested, killed, killed by time alone, survived; and the processor time."""
+    killed, minutes = sum(result.killed for result in tested), sum(result.seconds for result in tested) / 60
+    by_time = sum(result.killed and not result.noticed_by for result in tested)
+    print(f"{name:<28} {number:>6} {len(tested):>7} {killed:>7} {by_time:>8} {len(tested) - killed:>9} {minutes:>8.1f}")
 
 
 if __name__ == "__main__":

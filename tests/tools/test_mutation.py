@@ -2,6 +2,8 @@
 
 import ast
 import json
+import signal
+import subprocess
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,10 @@ def mutants(mutation: Any, module: str, number: int) -> list[Any]:
 
 
 def results(mutation: Any, wanted: list[Any], survivors: int) -> dict[Any, Any]:
-    return {m: mutation.Result(m, "hash", i >= survivors, "-a\n+b") for i, m in enumerate(wanted)}
+    return {
+        m: mutation.Result(m, "hash", i >= survivors, "-a\n+b", "test_law" * (i >= survivors), 1.5)
+        for i, m in enumerate(wanted)
+    }
 
 
 def test_every_module_of_the_core_and_the_algorithm_is_covered_by_tests_that_exist(mutation: Any) -> None:
@@ -74,6 +79,31 @@ def test_under_85_percent_fails_and_survivors_are_shown(
     assert f"score: {1 - survivors / 20:.1%}" in out
 
 
+def test_what_time_alone_killed_is_shown_too(mutation: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    wanted = mutants(mutation, "files.py", 2)
+    found = {wanted[0]: mutation.Result(wanted[0], "hash", True, "-a\n+b", "", 60.0)} | results(mutation, wanted[1:], 0)
+    assert mutation.report({"files.py": wanted}, wanted, found) == 0
+    out = capsys.readouterr().out
+    assert out.count("killed by time alone: files.py") == out.count("-a\n+b") == 1
+    assert out.splitlines()[-2].split() == ["total", "2", "2", "2", "1", "0", "1.0"]  # 61.5 s
+
+
+def test_an_endless_loop_is_ended_by_its_processor_time(
+    mutation: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    Path(tmp_path, "test_loop.py").write_text("def test_loop():\n    while True:\n        pass\n")
+    monkeypatch.setattr(mutation, "tests_of", lambda module: [str(tmp_path)])
+    done = subprocess.run(mutation.command_of("files.py", limit=1), capture_output=True, text=True, check=False)
+    assert -done.returncode in (signal.SIGKILL, signal.SIGXCPU)
+    assert not mutation.FAILED.search(done.stdout)
+
+
+def test_the_test_that_noticed_is_read_from_the_summary(mutation: Any) -> None:
+    assert mutation.FAILED.search("1 failed\nFAILED tests/a.py::test_b - assert 1").group(1) == "tests/a.py::test_b"
+    assert mutation.FAILED.search("ERROR tests/a.py\n1 error").group(1) == "tests/a.py"
+    assert not mutation.FAILED.search("1 passed")
+
+
 def test_a_module_without_a_mutant_fails(mutation: Any, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = mutants(mutation, "files.py", 20)
     assert mutation.report({"files.py": wanted, "locks.py": []}, wanted, results(mutation, wanted, 0)) == 1
@@ -88,7 +118,10 @@ def test_what_was_not_tested_in_time_fails(mutation: Any, capsys: pytest.Capture
 
 def test_a_second_run_takes_what_the_first_one_found(mutation: Any) -> None:
     wanted = mutants(mutation, "files.py", 2)
-    lines = [[*wanted[0], mutation.hash_of("files.py"), True, "diff"], [*wanted[1], "of other sources", True, "diff"]]
+    lines = [
+        [*wanted[0], mutation.hash_of("files.py"), True, "diff", "test_law", 1.5],
+        [*wanted[1], "of other sources", True, "diff", "test_law", 1.5],
+    ]
     mutation.RESULTS.write_text("".join(json.dumps(line) + "\n" for line in lines))
     known = mutation.test_all(wanted[:1], jobs=1, deadline=0.0)
     assert [known[m].killed for m in wanted[:1]] == [True]
