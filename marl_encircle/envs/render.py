@@ -38,10 +38,12 @@ __all__ = [
     "array_of",
     "check_display",
     "draw",
-    "draw_low",
     "draw_scene",
+    "draw_tall",
+    "draw_wide",
     "open_window",
     "picture",
+    "shrunk",
     "view",
 ]
 
@@ -53,14 +55,17 @@ SCENE = 720
 PANEL = 260
 """Width of the panel [pixels]."""
 
-LOW_SCENE, LOW_TITLE, LOW_PANEL = 560, 56, 186
-"""Of a drawing with the panel below: side of the scene, height of title and panel [pixels]."""
+TALL_SCENE, TALL_TITLE, TALL_PANEL = 560, 56, 186
+"""Of a tall drawing, with the panel below: side of the scene, height of title and panel [pixels]."""
 
 LENS, LENS_REACH = 0.36, 0.19
 """Side of the lens, as a share of the scene's; what it shows to each side of the target [half widths]."""
 
 LENS_LIMIT = 0.2
 """The lens is there once the target can reach no more than a circle of this radius [half widths]."""
+
+COMFORTABLE = 0.7
+"""Height of a resizable window on a large screen, as a share of the screen's."""
 
 EVERYTHING = Layers()
 
@@ -80,20 +85,30 @@ def array_of(surface: Any) -> NDArray[np.uint8]:
 
 def draw(view: View, layers: Layers = EVERYTHING) -> Any:
     """Return a drawing of the world as a pygame surface, the panel at its right; needs no display."""
+    return shrunk(draw_wide(view, layers))
+
+
+def draw_wide(view: View, layers: Layers = EVERYTHING) -> Any:
+    """Return the same, ``SUPERSAMPLING`` times as large."""
     large = _sheet(SCENE + PANEL, SCENE)
     draw_scene(_part(large, 0, 0, SCENE, SCENE), view, layers)
     Panel(_part(large, SCENE, 0, PANEL, SCENE), view).draw_column()
-    return pygame.transform.smoothscale(large, (SCENE + PANEL, SCENE))
+    return large
 
 
-def draw_low(view: View, layers: Layers = EVERYTHING) -> Any:
-    """Return a narrower drawing, the panel below, of which two fit side by side."""
-    height = LOW_TITLE + LOW_SCENE + LOW_PANEL
-    large = _sheet(LOW_SCENE, height)
-    Panel(_part(large, 0, 0, LOW_SCENE, LOW_TITLE), view).draw_head()
-    draw_scene(_part(large, 0, LOW_TITLE, LOW_SCENE, LOW_SCENE), view, layers)
-    Panel(_part(large, 0, LOW_TITLE + LOW_SCENE, LOW_SCENE, LOW_PANEL), view).draw_row()
-    return pygame.transform.smoothscale(large, (LOW_SCENE, height))
+def draw_tall(view: View, layers: Layers = EVERYTHING) -> Any:
+    """Return a narrower drawing, the panel below, of which two fit side by side; as large as that."""
+    large = _sheet(TALL_SCENE, TALL_TITLE + TALL_SCENE + TALL_PANEL)
+    Panel(_part(large, 0, 0, TALL_SCENE, TALL_TITLE), view).draw_head()
+    draw_scene(_part(large, 0, TALL_TITLE, TALL_SCENE, TALL_SCENE), view, layers)
+    Panel(_part(large, 0, TALL_TITLE + TALL_SCENE, TALL_SCENE, TALL_PANEL), view).draw_row()
+    return large
+
+
+def shrunk(large: Any) -> Any:
+    """Return a large drawing in its finished size, with smooth edges."""
+    width, height = large.get_size()
+    return pygame.transform.smoothscale(large, (width // SUPERSAMPLING, height // SUPERSAMPLING))
 
 
 def draw_scene(surface: Any, view: View, layers: Layers = EVERYTHING) -> None:
@@ -136,14 +151,15 @@ def open_window(title: str, size: tuple[int, int], advice: str, resizable: bool 
 
     :param size: width, height [pixels]
     :param advice: what to do where there is no display
-    :param resizable: by the user, and made to fit the screen at first
+    :param resizable: by the user, and at first as large as it is well seen on the screen
     :raises RuntimeError: if there is no display
     """
     check_display(advice)
     try:
         if resizable:
             desktop = pygame.display.get_desktop_sizes()[0]
-            share = min(1.0, 0.92 * desktop[0] / size[0], 0.86 * desktop[1] / size[1])
+            share = max(1.0, COMFORTABLE * desktop[1] / size[1])
+            share = min(share, 0.92 * desktop[0] / size[0], 0.86 * desktop[1] / size[1])
             size = (max(round(share * size[0]), 1), max(round(share * size[1]), 1))
         screen = pygame.display.set_mode(size, pygame.RESIZABLE if resizable else 0)
     except pygame.error as error:

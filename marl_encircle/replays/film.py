@@ -12,8 +12,8 @@ from PIL import Image
 
 from marl_encircle import files
 from marl_encircle.envs.palette import LINE
-from marl_encircle.envs.pen import pygame
-from marl_encircle.envs.render import EVERYTHING, array_of, draw, draw_low
+from marl_encircle.envs.pen import SUPERSAMPLING, pygame
+from marl_encircle.envs.render import EVERYTHING, array_of, draw_tall, draw_wide, shrunk
 from marl_encircle.envs.view import Layers
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match
@@ -29,16 +29,24 @@ GIF_COLOURS, GIF_FLAT = 160, 48
 
 def drawing(match: Match, number: int, step: int, layers: Layers = EVERYTHING) -> Any:
     """Return a drawing of one moment of a round as a pygame surface; two policies side by side."""
+    return shrunk(large_drawing(match, number, step, layers))
+
+
+def large_drawing(match: Match, number: int, step: int, layers: Layers = EVERYTHING, tall: bool = False) -> Any:
+    """Return the same, ``SUPERSAMPLING`` times as large.
+
+    :param tall: with the panel below the scene, as it always is of two policies
+    """
     views = match.views(number, step)
-    if len(views) == 1:
-        return draw(views[0], layers)
-    parts = [draw_low(view, layers) for view in views]
+    if len(views) == 1 and not tall:
+        return draw_wide(views[0], layers)
+    parts = [draw_tall(view, layers) for view in views]
     width, height = parts[0].get_size()
     both = pygame.Surface((len(parts) * width, height))
     for place, part in enumerate(parts):
         both.blit(part, (place * width, 0))
         if place:
-            pygame.draw.line(both, LINE, (place * width, 0), (place * width, height), 2)
+            pygame.draw.line(both, LINE, (place * width, 0), (place * width, height), 2 * SUPERSAMPLING)
     return both
 
 

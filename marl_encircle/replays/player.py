@@ -8,7 +8,7 @@ from marl_encircle.envs.pen import SUPERSAMPLING, draw_bar, pygame, write
 from marl_encircle.envs.render import EVERYTHING, check_display, open_window
 from marl_encircle.envs.view import Layers
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.replays.film import LAST, drawing
+from marl_encircle.replays.film import LAST, large_drawing
 from marl_encircle.replays.watch import Match
 
 BAR = 44
@@ -117,13 +117,16 @@ class Player:
         """Close the window."""
         self.over = True
 
-    def frame(self) -> Any:
-        """Return what the window shows, as a pygame surface."""
-        scene = drawing(self.match, self.number, self.step, self.layers)
+    def frame(self, tall: bool = False) -> Any:
+        """Return what the window shows, as a pygame surface ``SUPERSAMPLING`` times as large as it is meant to be.
+
+        :param tall: for a window that is higher than wide
+        """
+        scene = large_drawing(self.match, self.number, self.step, self.layers, tall)
         width, height = scene.get_size()
-        frame = pygame.Surface((width, height + BAR))
+        frame = pygame.Surface((width, height + BAR * SUPERSAMPLING))
         frame.blit(scene, (0, 0))
-        frame.blit(self._bar(width), (0, height))
+        frame.blit(self._bar(width // SUPERSAMPLING), (0, height))
         if self.help:
             overlay = _help(self.layers)
             frame.blit(overlay, ((width - overlay.get_width()) // 2, (height - overlay.get_height()) // 2))
@@ -155,7 +158,7 @@ class Player:
         speed = f"{self.fps * SPEEDS[self.speed]:g} steps/s"
         write(large, speed, ((width - 84) * SUPERSAMPLING, middle), 12, INK, 1.0)
         write(large, "h  help", ((width - 22) * SUPERSAMPLING, middle), 12, FAINT, 1.0)
-        return pygame.transform.smoothscale(large, (width, BAR))
+        return large
 
     def _draw_state(self, place: tuple[float, float], surface: Any) -> None:
         x, y = place
@@ -214,7 +217,7 @@ def _help(layers: Layers) -> Any:
         if key.label in _LAYER_KEYS:
             state = "on" if getattr(layers, _LAYER_KEYS[key.label]) else "off"
             write(large, state, ((width - 24) * SUPERSAMPLING, y), 13, INK if state == "on" else FAINT, 1.0)
-    return pygame.transform.smoothscale(large, (width, height))
+    return large
 
 
 def check_window() -> None:
@@ -230,7 +233,7 @@ def show(player: Player) -> None:
 
     :raises ConfigError: if there is no display
     """
-    size = player.frame().get_size()
+    size = _size(player.frame())
     try:
         screen = open_window("marl-encircle watch", size, NO_DISPLAY, resizable=True)
     except RuntimeError as error:
@@ -239,17 +242,21 @@ def show(player: Player) -> None:
     try:
         while not player.over:
             if changed:
-                _show_frame(screen, player.frame())
+                frame = player.frame(tall=screen.get_height() > screen.get_width())
+                _show_frame(screen, frame)
             seconds = clock.tick(REFRESH) / 1000
             changed = player.advance(seconds)
             for event in pygame.event.get():
-                changed |= _handle(player, event, screen, size)
+                changed |= _handle(player, event, screen, _size(frame))
     finally:
         pygame.display.quit()
 
 
 def _handle(player: Player, event: Any, screen: Any, size: tuple[int, int]) -> bool:
-    """Take in an event of the window, whose mouse may draw the line of steps along."""
+    """Take in an event of the window, whose mouse may draw the line of steps along.
+
+    :param size: of what is shown, see :func:`_size`
+    """
     pressed = event.type == pygame.MOUSEBUTTONDOWN and event.button == 1
     if pressed or (event.type == pygame.MOUSEMOTION and event.buttons[0]):
         left, top, width, height = _placed(size, screen.get_size())
@@ -262,6 +269,12 @@ def _handle(player: Player, event: Any, screen: Any, size: tuple[int, int]) -> b
     return player.handle(event)
 
 
+def _size(frame: Any) -> tuple[int, int]:
+    """Return width and height that a frame is meant to have [pixels]."""
+    width, height = frame.get_size()
+    return width // SUPERSAMPLING, height // SUPERSAMPLING
+
+
 def _placed(size: tuple[int, int], window: tuple[int, int]) -> tuple[int, int, int, int]:
     """Return left, top, width and height of a frame that is made as large as a window allows."""
     share = min(window[0] / size[0], window[1] / size[1])
@@ -272,8 +285,5 @@ def _placed(size: tuple[int, int], window: tuple[int, int]) -> tuple[int, int, i
 def _show_frame(screen: Any, frame: Any) -> None:
     left, top, width, height = _placed(frame.get_size(), screen.get_size())
     screen.fill(PAPER)
-    screen.blit(
-        frame if (width, height) == frame.get_size() else pygame.transform.smoothscale(frame, (width, height)),
-        (left, top),
-    )
+    screen.blit(pygame.transform.smoothscale(frame, (width, height)), (left, top))
     pygame.display.flip()

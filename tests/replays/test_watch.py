@@ -19,7 +19,8 @@ from PIL import Image
 from tiny_runs import command, copy_of_finished, finished, tiny
 
 from marl_encircle.core.simulator import world_seeds
-from marl_encircle.envs.render import LOW_SCENE, PANEL, SCENE, array_of, draw_low
+from marl_encircle.envs.pen import SUPERSAMPLING
+from marl_encircle.envs.render import PANEL, SCENE, TALL_PANEL, TALL_SCENE, TALL_TITLE, array_of, draw_tall, shrunk
 from marl_encircle.envs.view import Layer, Layers
 from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.evaluate import play_rounds
@@ -256,11 +257,11 @@ def test_an_mp4_can_be_read_back(tmp_path: Path) -> None:
 def test_two_policies_are_drawn_side_by_side_at_one_size() -> None:
     both = array_of(film.drawing(duel(), 0, 4))
     for place, view in enumerate(duel().views(0, 4)):
-        alone = array_of(draw_low(view))
-        part = both[:, place * LOW_SCENE : (place + 1) * LOW_SCENE]
+        alone = array_of(shrunk(draw_tall(view)))
+        part = both[:, place * TALL_SCENE : (place + 1) * TALL_SCENE]
         assert part.shape == alone.shape
         assert np.array_equal(part[:, 2:-2], alone[:, 2:-2])  # all but the line between them
-    assert both.shape[1] == 2 * LOW_SCENE
+    assert both.shape[1] == 2 * TALL_SCENE
 
 
 # --- The window -------------------------------------------------------------------------------------------------------
@@ -333,15 +334,15 @@ def test_a_layers_key_changes_the_scene_alone_and_back(unseen: None, key: int, l
     shown = Player(good(), number)
     press(shown, pygame.K_SPACE)
     shown.step = step
-    before = array_of(shown.frame())
+    before = array_of(shrunk(shown.frame()))
     press(shown, key)
     assert shown.layers == Layers()._replace(**{layer.value: False})
-    changed = (array_of(shown.frame()) != before).any(axis=2)
+    changed = (array_of(shrunk(shown.frame())) != before).any(axis=2)
     assert 50 < changed[:SCENE, :SCENE].sum() < 0.3 * SCENE * SCENE
     assert not changed[:, SCENE:].any()
     assert not changed[SCENE:].any()
     press(shown, key)
-    assert np.array_equal(array_of(shown.frame()), before)
+    assert np.array_equal(array_of(shrunk(shown.frame())), before)
 
 
 @cache
@@ -363,9 +364,9 @@ def lens_moment() -> tuple[int, int]:
 
 def test_help_covers_the_middle_and_names_every_key(unseen: None) -> None:
     shown = Player(match())
-    before = array_of(shown.frame())
+    before = array_of(shrunk(shown.frame()))
     press(shown, pygame.K_h)
-    changed = (array_of(shown.frame()) != before).any(axis=2)
+    changed = (array_of(shrunk(shown.frame())) != before).any(axis=2)
     assert changed[:, 300:650].any()
     assert not changed[:100].any()
     labels = [key.label for key in player.KEYS]
@@ -402,6 +403,32 @@ def test_a_window_plays_until_it_is_closed(unseen: None, monkeypatch: pytest.Mon
     assert frames
     assert shown.step == pytest.approx(shown.length / 2, abs=1)  # where the line of steps was touched
     assert not shown.playing
+
+
+@pytest.mark.parametrize(
+    ("desktop", "size"),
+    [((3840, 2160), (1939, 1512)), ((1920, 1080), (980, 764)), ((1024, 768), (847, 660)), ((400, 800), (368, 287))],
+)
+def test_a_window_is_as_large_as_it_is_well_seen(
+    unseen: None, monkeypatch: pytest.MonkeyPatch, desktop: tuple[int, int], size: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(pygame.display, "get_desktop_sizes", lambda: [desktop])
+    assert player.open_window("", (980, 764), "", resizable=True).get_size() == size
+
+
+def test_a_window_that_is_higher_than_wide_has_the_panel_below(unseen: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, frames = Player(match()), []
+    shown.playing = False
+
+    def show_frame(screen: Any, frame: Any) -> None:
+        frames.append(frame.get_size())
+        pygame.display.set_mode((400, 800) if len(frames) == 1 else (800, 400))
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_h if len(frames) < 3 else pygame.K_q))
+
+    monkeypatch.setattr(player, "_show_frame", show_frame)
+    player.show(shown)
+    wide, tall = (SCENE + PANEL, SCENE + BAR), (TALL_SCENE, TALL_TITLE + TALL_SCENE + TALL_PANEL + BAR)
+    assert [(width // SUPERSAMPLING, height // SUPERSAMPLING) for width, height in frames] == [wide, tall, wide]
 
 
 # --- The command ------------------------------------------------------------------------------------------------------
