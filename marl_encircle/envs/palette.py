@@ -22,8 +22,9 @@ LINE: Colour = (214, 214, 216)
 PAPER: Colour = (255, 255, 255)
 BACKGROUND: Colour = (246, 246, 244)
 GROOVE: Colour = (236, 236, 234)
-OBSTACLE: Colour = (150, 150, 154)
-OBSTACLE_EDGE: Colour = (104, 104, 110)
+OBSTACLE: Colour = (114, 114, 120)
+"""So dark that nobody takes it for the fourth pursuer's."""
+OBSTACLE_EDGE: Colour = (72, 72, 78)
 GOOD: Colour = (0, 122, 89)
 GAP: Colour = (213, 94, 0)
 """Where nobody is met."""

@@ -213,13 +213,24 @@ def test_long_names_are_cut_and_symbols_are_not_mistaken_for_names() -> None:
     assert pen._pieces("range R_m") == [(False, "range R"), (True, "m")]
 
 
-def test_colours_differ_also_in_brightness_or_hue_for_colour_blind_eyes() -> None:
-    # Pictures as seen without red cones (Vienot, Brettel and Mollon 1999), linear RGB.
-    to_dichromat = np.array([[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]])
-    colours = (np.array([*palette.PURSUERS, palette.OBSTACLE, palette.INK]) / 255.0) ** 2.2
-    seen = np.clip(colours @ to_dichromat.T, 0, 1) ** (1 / 2.2)
-    distance = np.linalg.norm(seen[:, None] - seen[None], axis=2) + np.eye(len(seen))
-    assert distance.min() > 0.08
+@pytest.mark.parametrize(
+    "seen_as",
+    [
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    ],
+    ids=["no red cones", "no green cones", "no blue cones"],
+)
+def test_colours_differ_for_colour_blind_eyes(seen_as: list[list[float]]) -> None:
+    # Machado, Oliveira and Fernandes (2009), in linear RGB; distances in CIELAB, of which 2.3 can just be seen.
+    colours = np.array([*palette.PURSUERS, palette.OBSTACLE, palette.INK, palette.LINE]) / 255.0
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.cbrt((np.clip(linear @ np.transpose(seen_as), 0, 1) @ to_xyz.T / to_xyz.sum(axis=1)).T)
+    lab = np.stack([116 * y, 500 * (x - y), 200 * (y - z)], axis=1)
+    distance = np.linalg.norm(lab[:, None] - lab[None], axis=2) + 100 * np.eye(len(lab))
+    assert distance.min() > 12
 
 
 def test_without_a_render_mode_nothing_is_remembered_and_a_picture_is_refused_kindly() -> None:
