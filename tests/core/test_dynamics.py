@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mpe2._mpe_utils.core import Agent, Landmark, World
 
+from marl_encircle.core.dynamics import TARGETS
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
 
@@ -76,6 +77,7 @@ def test_full_speed_takes_as_many_steps_as_the_notes_say(acceleration: float, st
 
 def test_actions_beyond_one_count_as_one() -> None:
     assert velocity(push(one(), (7.0, -1e9))) == velocity(push(one(), (1.0, -1.0)))
+    assert velocity(push(one(), (-7.0, 1e9))) == velocity(push(one(), (-1.0, 1.0)))
 
 
 def test_no_damping_and_full_damping() -> None:
@@ -119,6 +121,11 @@ def test_bodies_that_just_touch_push_by_the_logarithm_of_two() -> None:
     assert velocity(gap_of(0.1, contact_force=300.0), 1) == near(3 * 0.00693147180559945, 0.0)
     # First order: the same on top of the action's velocity
     assert velocity(gap_of(0.1, dynamics="first_order"), 1) == near(0.00693147180559945, 0.0)
+
+
+def test_a_contact_of_many_margins_pushes_by_its_depth() -> None:
+    # 0.09 / 1e-4 = 900 margins deep, where exp(900) overflows: F = 10 x 0.09 = 0.9
+    assert velocity(gap_of(0.01, contact_margin=1e-4, contact_force=10.0), 1) == near(0.09, 0.0)
 
 
 def test_a_force_of_contact_vanishes_where_it_is_cut_off() -> None:
@@ -172,6 +179,7 @@ def test_coincident_bodies_part_and_stay_finite(contacts: str) -> None:
     two = arranged([(0.5, 0.5)] * 2, contacts=contacts, target="still")
     push(two)
     assert abs(position(two, 0)[0] - position(two, 1)[0]) >= 0.1 - 1e-12
+    assert position(two, 0)[1] == position(two, 1)[1] == 0.5, "along x"
 
 
 @given(
@@ -203,6 +211,34 @@ def test_the_mpe2_order_is_mpe2(numbers: list[float], acceleration: float, speed
         push(ours, u, -u)
         np.testing.assert_allclose(ours.state.pursuers[0], [a.state.p_pos for a in world.agents], atol=1e-12)
         np.testing.assert_allclose(ours.state.velocities[0], [a.state.p_vel for a in world.agents], atol=1e-12)
+
+
+CROWDS = {
+    "soft": {},
+    "first order, from the surface": {"dynamics": "first_order", "repulsion_from": "surface", "path_rule": "relaxed"},
+    "mpe2, softened": {"integration": "mpe2", "repulsion_softening": 0.1, "turn_order": "simultaneous"},
+    "hard, first power": {"contacts": "hard", "repulsion_power": 1, "path_rule": "relaxed"},
+    "hard, first order": {"contacts": "hard", "dynamics": "first_order", "obstacle_margin": 0.02},
+}
+
+
+@pytest.mark.parametrize("fields", CROWDS.values(), ids=CROWDS)
+@pytest.mark.parametrize("seed", range(8))
+def test_x_and_y_and_their_signs_are_alike(fields: dict[str, object], seed: int) -> None:
+    # A crowd in a corner, where bodies overlap and walls are near; one obstacle is farther off
+    rng = np.random.default_rng(seed)
+    bodies, v, actions = rng.uniform(0.6, 0.98, (6, 2)), rng.uniform(-1, 1, (3, 2)), rng.uniform(-1.5, 1.5, (3, 3, 2))
+    discs = np.column_stack([bodies[4:] - [[0.0], [0.4]], [0.1, 0.15]])
+    ends = []
+    for turn in (np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])):
+        turned_discs = [(*centre, radius) for centre, radius in zip(discs[:, :2] @ turn, discs[:, 2], strict=True)]
+        sim = arranged(bodies[:3] @ turn, bodies[3] @ turn, turned_discs, v @ turn, safety_distance=0.05, **fields)
+        for step in actions:
+            push(sim, *(step @ turn))
+        s = sim.state
+        ends.append(np.concatenate([s.pursuers[0], s.velocities[0], s.target]) @ turn.T)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-9)
+    np.testing.assert_allclose(ends[2], ends[0], atol=1e-9)
 
 
 # The target. One step is at most 1.1 x 1 x 0.1 = 0.11
@@ -285,6 +321,12 @@ def test_a_still_target_never_moves() -> None:
     assert sim.state.target[0].tolist() == [0.0, 0.0]
 
 
+def test_a_target_that_move_target_does_not_know_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TARGETS, "third", TARGETS["still"])
+    with pytest.raises(ValueError, match="a name in TARGETS has no branch in move_target"):
+        push(arranged([(-0.2, 0.0)], target="third"))
+
+
 # The path. Samples at 0.011, 0.022, ... 0.11. One pursuer chases from behind (1/0.46^2 = 4.73, or 1/0.3^2 = 11.1),
 # another body is 0.5 ahead (4)
 
@@ -329,6 +371,13 @@ def test_what_lies_behind_the_first_invalid_sample_does_not_count() -> None:
     assert escaped(**thin) == near(0.022, 0.0)
     # A single sample sees only the end of the path
     assert escaped(**thin, path_samples=1) == near(0.11, 0.0)
+
+
+def test_a_small_body_at_the_end_of_the_path_is_seen_from_its_start() -> None:
+    # Reach 0.001 + 0.005 around 0.1045: the sample at 0.099 is within it, that at 0.11 too
+    thin = {"target_radius": 0.005, "safety_distance": 0.01}
+    assert escaped([(-0.03, 0.0)], discs=[(0.1045, 0.0, 0.001)], **thin) == near(0.088, 0.0)
+    assert escaped([(0.0, -0.03)], discs=[(0.0, 0.1045, 0.001)], **thin) == near(0.0, 0.088)
 
 
 def test_the_safety_distance_and_the_ratio_are_those_of_the_world() -> None:
