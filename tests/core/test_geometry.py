@@ -323,6 +323,20 @@ def test_contacts_count_each_kind_of_body_apart() -> None:
     assert m.contacts_obstacles.tolist() == [[0, 0, 2]]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_contacts_are_those_of_a_plain_count(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    p, t, discs = rng.uniform(-0.3, 0.3, (6, 2)), rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.3, 0.3, (4, 3))
+    discs[:, 2] = rng.uniform(0.02, 0.2, 4)
+    m = arranged(p, t, discs, pursuer_radius=0.09, target_radius=0.04).measure
+    others = np.array([[math.dist(a, b) < 0.18 for a in p] for b in p]) & ~np.eye(6, dtype=bool)
+    np.testing.assert_array_equal(m.contacts_pursuers[0], others.sum(axis=1))
+    np.testing.assert_array_equal(m.contacts_target[0], [math.dist(a, t) < 0.13 for a in p])
+    touched = [[math.dist(a, (x, y)) < 0.09 + r for x, y, r in discs] for a in p]
+    np.testing.assert_array_equal(m.contacts_obstacles[0], np.sum(touched, axis=1))
+    np.testing.assert_allclose(m.target_distance[0], [math.dist(a, t) for a in p])
+
+
 def test_bodies_that_just_meet_are_no_contact() -> None:
     m = arranged([(0.125, 0.0), (0.375, 0.0)], discs=[(1.0, 0.0, 0.5)], pursuer_radius=0.125, target_radius=0.0).measure
     assert m.contacts_pursuers.tolist() == [[0, 0]]  # 0.25 = 2 x 0.125
