@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from marl_encircle import files
 from marl_encircle.envs.palette import LINE
@@ -17,6 +16,11 @@ from marl_encircle.envs.render import EVERYTHING, array_of, draw_tall, draw_wide
 from marl_encircle.envs.view import Layers
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match
+
+try:
+    from PIL import Image
+except ImportError as error:
+    raise ImportError("pictures need Pillow: pip install 'marl-encircle[render]'") from error
 
 Picture = NDArray[np.uint8]
 

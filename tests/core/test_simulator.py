@@ -262,7 +262,7 @@ FUZZED = {
 def degenerate(sim: Simulator, rng: np.random.Generator) -> None:
     """Put bodies where they cannot be: on each other, in obstacles, out of the scene, almost on each other."""
     s, n = sim.state, sim.scenario.pursuers
-    for b in rng.choice(sim.n_worlds, sim.n_worlds // 4, replace=False):
+    for b in rng.choice(sim.n_worlds, max(sim.n_worlds // 4, 1), replace=False):
         kind = rng.integers(7)
         i, j = rng.integers(n), rng.integers(n)
         if kind == 0:

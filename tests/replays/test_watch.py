@@ -475,11 +475,12 @@ def test_a_film_of_another_kind_is_refused_before_anything_is_played(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_pygame_the_extra_is_named() -> None:
+@pytest.mark.parametrize(("module", "words"), [("pygame", "drawing needs pygame-ce"), ("PIL", "pictures need Pillow")])
+def test_without_what_draws_the_extra_is_named(module: str, words: str) -> None:
     program = (
-        "import sys; sys.modules['pygame'] = None; sys.argv = ['marl-encircle', 'watch']; "
+        f"import sys; sys.modules[{module!r}] = None; sys.argv = ['marl-encircle', 'watch']; "
         "from marl_encircle.cli import main; main()"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == "error: drawing needs pygame-ce: pip install 'marl-encircle[render]'\n"
+    assert done.stderr == f"error: {words}: pip install 'marl-encircle[render]'\n"
