@@ -310,6 +310,19 @@ def test_a_pursuer_on_the_target_and_a_target_in_an_obstacle_give_finite_numbers
         assert not np.isnan(enclosure.movement_range).any()
 
 
+def test_a_pursuer_on_the_target_blocks_a_cone_around_the_x_axis() -> None:
+    enclosure = rule(Layout(((0.0, 0.0),), (), 1.25), n_directions=360)
+    assert enclosure.contributing_angle[0, 0] / 2 == pytest.approx(math.asin(0.8), abs=TURN / 360)
+    assert enclosure.owner[0, 53] == enclosure.owner[0, -53] == 0  # arcsin(0.8) is 53.13 degrees
+    assert enclosure.owner[0, 54] == enclosure.owner[0, -54] == NOBODY
+    assert enclosure.distance[0, 0] < 1e-12
+
+
+def test_a_share_is_occupied_from_itself_on() -> None:
+    enclosure = rule(Layout(((0.3, 0.1),), (), 1.25))._replace(occupied_angle=np.array([0.3 * TURN]))
+    assert [bool(enclosure.occupies(share)[0]) for share in (0.0, 0.29, 0.3, 0.31, 1.0)] == [True] * 3 + [False] * 2
+
+
 # Distances and contacts
 
 

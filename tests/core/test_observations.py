@@ -40,6 +40,16 @@ def test_the_layout_covers_the_observation_without_gap(
     assert np.isfinite(seen(sim)).all(), "every number is written"
 
 
+def test_the_bounds_by_hand() -> None:
+    scenario = Scenario(pursuers=2, half_width=3.0, max_speed=1.7, observe_extras=EXTRAS)
+    low, high = bounds(scenario)
+    # Two bodies are at most 6 apart along an axis; a direction is at most 1, as are a share and a stage
+    expected = [3, 3, 1.7, 1.7, *[6] * 6, *[1] * 6, 1, 1, math.inf]
+    np.testing.assert_allclose(high, expected, rtol=2e-6)
+    assert (high >= np.float32(expected)).all(), "rounding included"
+    np.testing.assert_array_equal(low, -high)
+
+
 def test_three_pursuers_and_one_obstacle_have_the_papers_twelve_numbers() -> None:
     # 2 position + 2 velocity + 2 target + 2 x 2 pursuers + 2 obstacle
     assert max(p.stop for p in layout(Scenario(observe_directions=False)).values()) == 12

@@ -71,6 +71,20 @@ def test_the_registry_is_what_the_file_defines() -> None:
     assert set(TERMS) >= rewards.CONTRACTION_STAGE
 
 
+def test_the_default_reward_is_that_of_the_notes() -> None:
+    reward = Reward()
+    assert (reward.closure, reward.two_stage, reward.scale) == ("all", True, 0.05)
+    assert {name: weight for name, (weight, _) in reward.active.items()} == {
+        "overall_angle": 1,
+        "contributing_angle": 1,
+        "obstacle_angle": 0.5,
+        "contraction": 1,
+        "collision": 0.5,
+        "completion": 50,
+        "time": 8,
+    }
+
+
 # Terms
 
 

@@ -35,7 +35,7 @@ def measured(complete_all: list[bool], complete_pursuers: list[bool], step: int)
 def shares(step: int) -> dict[str, np.ndarray]:
     return {
         "time": np.array([[-1.0, -1.0], [-2.0, -2.0]]),
-        "contraction": np.array([[1.0, 3.0], [5.0, 7.0]]) * step,
+        "contraction": np.array([[1.0, 4.0], [5.0, 7.0]]) * step,
     }
 
 
@@ -57,14 +57,14 @@ def test_a_success_step_is_the_first_under_each_rule() -> None:
 
 def test_a_step_returns_the_sum_of_its_shares() -> None:
     rewards = Rounds(SCENARIO, "all", 2).add(np.ones(2, np.int64), measured([False] * 2, [False] * 2, 1), shares(3))
-    assert rewards.tolist() == [[2.0, 8.0], [13.0, 19.0]]
+    assert rewards.tolist() == [[2.0, 11.0], [13.0, 19.0]]
 
 
 def test_figures_grow_up_to_success_and_no_further() -> None:
     rounds = played()
     # World 0 counts steps 1 and 2, world 1 all four: contraction 1 + 2 = 3 and 1 + 2 + 3 + 4 = 10 times its number
     assert rounds.length.tolist() == [2, 4]
-    assert rounds.returns.tolist() == [[-2 + 3, -2 + 9], [-8 + 50, -8 + 70]]
+    assert rounds.returns.tolist() == [[-2 + 3, -2 + 12], [-8 + 50, -8 + 70]]
     # Contacts: world 0 (2 + 1) + (3 + 2), world 1 (3 + 2) + (4 + 3) + (5 + 4) + (6 + 5)
     assert rounds.contacts_pursuers.tolist() == [8, 32]
     assert rounds.contacts_obstacles.tolist() == [80, 320]
@@ -89,6 +89,7 @@ def test_the_summary_holds_each_figure_by_its_name() -> None:
         "reward/time": -8.0,
         "reward/contraction": 60.0,  # (5 + 7) / 2 x 10
     }
+    assert played().summary(0)["reward/contraction"] == 7.5  # (1 + 4) / 2 x 3
     assert (played().summary(0)["success_all"], played().summary(0)["success_pursuers"]) == (1.0, 1.0)
 
 

@@ -36,6 +36,25 @@ def test_the_defaults_are_those_of_the_notes() -> None:
     assert s.agents == ("pursuer_0", "pursuer_1", "pursuer_2")
 
 
+def test_the_limits_are_those_of_the_notes() -> None:
+    positive = ("obstacle_radius", "time_step", "max_speed", "acceleration", "pursuer_mass")
+    at_least_0 = ("pursuer_radius", "target_radius", "contact_force", "repulsion_softening", "wall_weight")
+    assert {f.name: (f.metadata["low"], f.metadata["high"]) for f in NUMBERS} == {
+        **dict.fromkeys(positive, (1e-6, math.inf)),
+        **dict.fromkeys((*at_least_0, "safety_distance", "obstacle_margin"), (0, math.inf)),
+        **dict.fromkeys(("movement_range_limit", "contact_margin", "direction_softening"), (1e-9, math.inf)),
+        **dict.fromkeys(("stage_threshold", "damping", "obstacle_limit"), (0, 1)),
+        "pursuers": (1, 64),
+        "obstacles": (0, 64),
+        "speed_ratio": (1, 100),
+        "max_cycles": (1, 100_000),
+        "half_width": (1e-3, 1e3),
+        "n_directions": (8, 4096),
+        "repulsion_power": (1, 2),
+        "path_samples": (1, 1000),
+    }
+
+
 @pytest.mark.parametrize("name", [f.name for f in NUMBERS])
 def test_a_number_out_of_range_or_of_another_type_names_the_field(name: str) -> None:
     meta = next(f.metadata for f in NUMBERS if f.name == name)
