@@ -15,12 +15,16 @@ import json
 import os
 import shutil
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 TEMPORARY_PREFIX = ".tmp"
+
+# What the kernel says on opening a folder, a loop of links, a socket, a device without a driver.
+_NOT_REGULAR = (errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.ENODEV)
 
 _counter = itertools.count()
 
@@ -195,8 +199,8 @@ def _rotate(temporary: Path, path: Path, former: Path) -> None:
 def _former(path: Path) -> Iterator[BinaryIO | None]:
     """Open the file of that name; the handle outlives the name. None where there is no file."""
     try:
-        handle = path.open("rb")
-    except FileNotFoundError:
+        handle = open_regular(path)
+    except (FileNotFoundError, DamagedFileError):
         yield None
         return
     with handle:
@@ -215,6 +219,28 @@ def _restore(former: BinaryIO | None, temporary: Path, path: Path) -> None:
     temporary.replace(path)
 
 
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a file for reading that somebody else may have put there; reading a pipe or a device might never end.
+
+    :raises DamagedFileError: if it is no regular file
+    :raises OSError: if it cannot be opened, FileNotFoundError if there is none
+    """
+    try:
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115 - Path.open takes no opener
+    except OSError as error:
+        if error.errno in _NOT_REGULAR:
+            raise DamagedFileError(path, "not a regular file") from error
+        raise
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise DamagedFileError(path, "not a regular file")
+    return file
+
+
+def _open_at_once(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NONBLOCK)  # nobody may ever come to the other end of a pipe
+
+
 def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | None = None) -> bytes:
     """Read a file that somebody else may have changed.
 
@@ -222,14 +248,14 @@ def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | 
     :param sha256: what it must hash to, in hexadecimal
     :param max_bytes: size above which it is refused unread
     :return: its content
-    :raises DamagedFileError: when it is missing, too large or not what was written
+    :raises DamagedFileError: when it is missing, no regular file, too large or not what was written
     """
     path = Path(path)
     limit = -1 if max_bytes is None else max_bytes + 1
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             data = file.read(limit)
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise DamagedFileError(path, "the file is missing") from error
     if max_bytes is not None and len(data) > max_bytes:
         raise DamagedFileError(path, f"larger than the {max_bytes} bytes allowed")
@@ -243,9 +269,3 @@ def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | 
 def sha256_bytes(data: bytes) -> str:
     """SHA-256 of bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
-
-
-def sha256_file(path: str | Path) -> str:
-    """SHA-256 of a file, in hexadecimal, read in pieces."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -70,7 +70,7 @@ def write_run(
         "config": config,
         "config_hash": config_hash(config),
         "seed": seed,
-        "sha256": {name: files.sha256_file(run / name) for name in texts},
+        "sha256": {name: files.sha256_bytes((run / name).read_bytes()) for name in texts},
     }
     files.write_json(run / "run.json", record)
     return run

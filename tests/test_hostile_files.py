@@ -27,10 +27,10 @@ import pytest
 import safetensors.torch
 import torch as th
 from ruamel.yaml import YAML
-from tiny_runs import TINY, command, copy_of_finished, finished, tiny_arguments
+from tiny_runs import TINY, command, copy_of_finished, finished, tiny, tiny_arguments
 
 from marl_encircle import files, load_policy
-from marl_encircle.experiments import checkpoint
+from marl_encircle.experiments import checkpoint, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.build import load_run, policy_bytes
 from marl_encircle.experiments.config import load_config
@@ -396,11 +396,12 @@ def read_lies(root: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
     believed = 0
     for run in sorted(root.iterdir()):
-        try:
-            load_run(run)
-            believed += 1
-        except files.DamagedFileError:
-            pass
+        for door, name in ((load_run, ""), (checkpoint.load_tree, "policy.safetensors")):
+            try:
+                door(run / name)
+                believed += 1
+            except files.DamagedFileError:
+                pass
     raise SystemExit(believed)
 
 
@@ -424,12 +425,125 @@ def test_a_header_that_lies_is_refused_by_name(place: Place, lie: str) -> None:
     assert len(str(caught.value)) < 500
 
 
-@pytest.mark.parametrize("lie", [name for name, data in LIES.items() if len(data) < 1 << 20])
+def tree(value: object) -> dict[str, str]:
+    """The metadata of a checkpoint."""
+    text = value if isinstance(value, str) else json.dumps(value)
+    return {"tree": f"{files.sha256_bytes(text.encode())} {text}"}
+
+
+EMPTY = {"a": entry("U8", [0], 0, 0)}
+HASH = files.sha256_bytes(b"|u1 (0,)")
+TREES: dict[str, tuple[bytes, str]] = {
+    "no metadata": (header({"a": entry("U8", [2], 0, 2)}, bytes(2)), "not the tree that says what they are"),
+    "other metadata": (header({"__metadata__": {"format": "pt"}}), "not the tree that says what they are"),
+    "a tree without its hash": (header({"__metadata__": {"tree": "{}"}}), "its tree has changed"),
+    "a list": (header({"__metadata__": tree([1])}), r"its tree is \[1\], no dictionary"),
+    "many brackets": (header({"__metadata__": tree("[" * 50_000)}), "recursion"),
+    "a long number": (header({"__metadata__": tree("9" * 50_000)}), "limit"),
+    "one array many times": (
+        header({"__metadata__": tree({"x": [{"$array": "a", "sha256": HASH}] * 9}), **EMPTY}), "'a'"),
+    "an array too many": (header({"__metadata__": tree({}), **EMPTY}), "lacks 1 of the arrays, a among them"),
+    "an array too few": (header({"__metadata__": tree({"x": {"$array": "a", "sha256": HASH}})}), "'a'"),
+    "an array without its hash": (header({"__metadata__": tree({"x": {"$array": "a"}}), **EMPTY}), "'sha256'"),
+    "another hash": (header({"__metadata__": tree({"x": {"$array": "a", "sha256": ""}}), **EMPTY}), "a has changed"),
+    "a list for a name": (header({"__metadata__": tree({"x": {"$array": ["a"]}}), **EMPTY}), "unhashable"),
+    **{
+        f"a type that NumPy lacks: {kind}": (
+            header({"__metadata__": tree({"x": {"$array": "a"}}), "a": entry(kind, [2], 0, size)}, bytes(size)),
+            "data type|attribute",
+        )
+        for kind, size in {"BF16": 4, "F8_E4M3": 2, "F8_E5M2": 2, "F4": 1}.items()
+    },
+}  # fmt: skip
+"""What a checkpoint says of itself, and the reason why it is refused."""
+
+
+def test_what_those_trees_are_made_of_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(header({"__metadata__": tree({"x": {"$array": "a", "sha256": HASH}}), **EMPTY}))
+    assert checkpoint.load_tree(path)["x"].shape == (0,)
+
+
+@pytest.mark.parametrize("lie", [*LIES, *TREES])
 def test_a_checkpoint_that_lies_is_refused_by_name(tmp_path: Path, lie: str) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    path.write_bytes(LIES[lie])
-    with pytest.raises(files.DamagedFileError, match=r"checkpoint\.safetensors: not a valid checkpoint: ."):
+    data, reason = TREES.get(lie) or (LIES[lie], ".")
+    path.write_bytes(data)
+    with pytest.raises(
+        files.DamagedFileError, match=rf"checkpoint\.safetensors: not a valid checkpoint: .*(?i:{reason})"
+    ):
         checkpoint.load_tree(path)
+
+
+def test_a_checkpoint_larger_than_the_memory_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    size = 1 << 42  # which takes no room on the disk
+    with path.open("wb") as file:
+        file.write(header({"__metadata__": tree({"x": {"$array": "a"}}), "a": entry("F32", [size // 4], 0, size)}))
+        file.truncate(file.tell() + size)
+    with pytest.raises(files.DamagedFileError, match="larger than this machine's memory"):
+        checkpoint.load_tree(path)
+
+
+class Interrupt(Exception):  # noqa: N818 - no error
+    """As a kill after a checkpoint."""
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a tiny training that was stopped after some updates."""
+
+    def save_and_stop(self: train._Run) -> None:
+        save(self)
+        if self.model._n_updates:
+            raise Interrupt
+
+    save, out = train._Run.save_checkpoint, tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train._Run, "save_checkpoint", save_and_stop)
+        with pytest.raises(Interrupt):
+            train.train(tiny(), 0, "native", out, checkpoint_every=1e-9)
+    return train.run_folder(tiny(), 0, out)
+
+
+MISFITS: dict[str, list[Any]] = {
+    "seconds": ["x", []],
+    "rows": [1, [1]],
+    "training": ["x"],
+    "training/parameters/policy": [{}],
+    "training/parameters/actor.optimizer/state": [{"0": {"exp_avg": np.zeros((3, 5), np.float32)}}],
+    "training/counters/num_timesteps": ["x", None],
+    "training/last_obs": [np.zeros((3, 5), np.float32), None],
+    "training/last_episode_starts": [np.zeros(3, bool)],
+    "training/monitor/episode_returns": [np.zeros(3)],
+    "training/replay/rewards": [np.zeros((240, 7), np.float32), np.zeros((10**5, 3), np.float32)],
+    "training/replay_position": [[-1, False], [10**9, False]],
+    "training/worlds": [[], ["x"], {}],
+    "training/world_steps": ["x"],
+    "training/random/exploration": [{"bit_generator": "MT19937"}],
+    "training/random/exploration/state/state": [-1],
+    "training/random/numpy": [[]],
+    "training/random/torch": [np.zeros(3, np.uint8)],
+    "training/random/python": [[3, [1], None]],
+}
+"""What a checkpoint may hold that no training has saved."""
+
+
+@pytest.mark.parametrize(("key", "number"), [(key, i) for key, values in MISFITS.items() for i in range(len(values))])
+def test_what_no_training_has_saved_is_not_gone_on_with(
+    tmp_path: Path, interrupted: Path, key: str, number: int
+) -> None:
+    folder = train.run_folder(tiny(), 0, tmp_path)
+    saved = checkpoint.load(interrupted)
+    *path, last = key.split("/")
+    place: Any = saved
+    for part in path:
+        place = place[part]
+    assert last in place
+    place[last] = MISFITS[key][number]
+    checkpoint.save(folder, saved or {})
+    with pytest.raises(files.DamagedFileError, match=r"checkpoint\.safetensors: does not fit this training: ."):
+        train.train(tiny(), 0, "native", tmp_path)
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:

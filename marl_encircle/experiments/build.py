@@ -203,7 +203,7 @@ def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MA
     elif fields:
         raise ConfigError(f"{what}: has a setting of its own; {', '.join(fields)} can only be given with a name")
     path = Path(what)
-    if trusted and zipfile.is_zipfile(path):
+    if trusted and path.is_file() and zipfile.is_zipfile(path):
         try:
             return load_actors(path)
         except Exception as error:  # unpickling raises whatever it likes

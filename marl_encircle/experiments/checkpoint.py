@@ -5,11 +5,13 @@ file, the tree that refers to them and has their hashes into its metadata as JSO
 all of it. A run folder keeps the two newest ones.
 """
 
+import errno
 import hashlib
 import json
 import logging
+import os
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ import torch as th
 
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
+from marl_encircle.experiments.trainable import available_memory
 from marl_encircle.maddpg import MADDPG
 
 NAME = "checkpoint.safetensors"
@@ -28,6 +31,18 @@ ARRAY = "$array"
 COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
 MONITOR = ("episode_returns", "episode_lengths")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+MAX_HEADER_BYTES = 1 << 24
+"""Largest header, with the tree; the most worlds of the native engine need 12 MB. Each name in it costs memory."""
+
+_FAULTS = (
+    *(OSError, MemoryError, RecursionError, safetensors.SafetensorError),
+    *(AttributeError, KeyError, TypeError, ValueError),  # AttributeError: of a type that NumPy lacks
+)
+"""What reading a stranger's checkpoint may raise."""
+
+MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What :func:`restore` may raise for what another training, or a stranger, has saved."""
 
 logger = logging.getLogger(__name__)
 
@@ -76,12 +91,17 @@ def save_tree(path: Path, tree: Mapping[str, Any], former: Path | None = None) -
 
     :param tree: dictionaries with names as keys, lists, arrays, tensors, numbers, strings, None
     :param former: name that the old file takes
+    :raises OSError: with the file's name; the old file is unchanged
     """
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps(_take_arrays(tree, "", arrays))
     checked = f"{files.sha256_bytes(text.encode())} {text}"
+    header = _header(arrays, {"tree": checked})
+    if len(header) > MAX_HEADER_BYTES:
+        reason = f"its header of {len(header)} bytes could not be read back; train with fewer worlds"
+        raise OSError(errno.EFBIG, f"not saved: {reason}", str(path))
     pieces = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
-    files.write_bytes(path, _header(arrays, {"tree": checked}), *pieces, former=former)
+    files.write_bytes(path, header, *pieces, former=former)
 
 
 def _header(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> bytes:
@@ -107,14 +127,27 @@ def load_tree(path: Path) -> dict[str, Any]:
     :raises DamagedFileError: if it is no such file, or a bit of it has changed
     """
     try:
+        with files.open_regular(path) as start:
+            if int.from_bytes(start.read(8), "little") > MAX_HEADER_BYTES:
+                raise ValueError(f"its header is larger than the {MAX_HEADER_BYTES} bytes allowed")
+            if os.fstat(start.fileno()).st_size > available_memory():
+                raise ValueError("it is larger than this machine's memory")
         with safetensors.safe_open(path, framework="numpy") as file:
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-            sha256, _, text = file.metadata()["tree"].partition(" ")
-        if files.sha256_bytes(text.encode()) != sha256:
-            raise ValueError("its tree has changed since it was written")
-        restored: dict[str, Any] = _put_arrays(json.loads(text), arrays)
-    except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise files.DamagedFileError(path, f"not a valid checkpoint: {str(error)[:200]}") from error
+            checked = (file.metadata() or {}).get("tree")
+            if checked is None:
+                raise ValueError("there are arrays in it, but not the tree that says what they are")
+            sha256, _, text = checked.partition(" ")
+            if files.sha256_bytes(text.encode()) != sha256:
+                raise ValueError("its tree has changed since it was written")
+            names = set(file.keys())
+            restored = _put_arrays(json.loads(text), file.get_tensor, names)
+        if not isinstance(restored, dict):
+            raise ValueError(f"its tree is {restored!r:.80}, no dictionary")
+        if names:
+            raise ValueError(f"its tree lacks {len(names)} of the arrays, {min(names):.80} among them")
+    except _FAULTS as error:
+        reason = error.reason if isinstance(error, files.DamagedFileError) else str(error)[:200]
+        raise files.DamagedFileError(path, f"not a valid checkpoint: {reason}") from error
     return restored
 
 
@@ -146,18 +179,25 @@ def capture(model: MADDPG, curriculum: CurriculumVecEnv, *, with_replay: bool = 
 
 
 def restore(model: MADDPG, curriculum: CurriculumVecEnv, saved: Mapping[str, Any]) -> None:
-    """Put a freshly built model and its environment where :func:`capture` was called, bit for bit."""
+    """Put a freshly built model and its environment where :func:`capture` was called, bit for bit.
+
+    :raises Exception: ``MISFIT``, if it was captured from others
+    """
     restore_parameters(model, saved)
-    model._last_obs = saved["last_obs"]
-    model._last_episode_starts = saved["last_episode_starts"]
+    slots = curriculum.num_envs
+    model._last_obs = _of_shape(saved["last_obs"], slots, *(curriculum.observation_space.shape or ()))
+    model._last_episode_starts = _of_shape(saved["last_episode_starts"], slots)
     for name, value in saved.get("monitor", {}).items():  # older checkpoints have none; it is only logged
-        setattr(model.env, name, value)
+        setattr(model.env, name, _of_shape(value, slots))
     buffer = model.replay_buffer
     assert buffer is not None
     for name in REPLAY:
         getattr(buffer, name)[: len(saved["replay"][name])] = saved["replay"][name]
-    buffer.pos, buffer.full = saved["replay_position"]
-    curriculum.world_steps = saved["world_steps"]
+    position, full = saved["replay_position"]
+    buffer.pos, buffer.full = int(position), bool(full)
+    if not 0 <= buffer.pos < buffer.buffer_size:
+        raise ValueError(f"{buffer.pos} is no place in a replay buffer of {buffer.buffer_size}")
+    curriculum.world_steps = int(saved["world_steps"])
     slots_each = curriculum.num_envs // len(saved["worlds"])
     for i, state in enumerate(saved["worlds"]):
         curriculum.venv.env_method("set_state", state, indices=[i * slots_each])
@@ -172,8 +212,19 @@ def restore(model: MADDPG, curriculum: CurriculumVecEnv, saved: Mapping[str, Any
 def restore_parameters(model: MADDPG, saved: Mapping[str, Any]) -> None:
     """Put weights, optimisers and counters back."""
     model.set_parameters({name: to_torch(value) for name, value in saved["parameters"].items()})
+    for network in (model.actor, model.critic):
+        for parameter, state in network.optimizer.state.items():
+            for value in state.values():
+                _of_shape(value, *(parameter.shape if value.ndim else ()))
     for name in COUNTERS:
-        setattr(model, name, saved["counters"][name])
+        setattr(model, name, type(getattr(model, name))(saved["counters"][name]))
+
+
+def _of_shape(value: Any, *shape: int) -> Any:
+    """Return an array or tensor of that shape; raise a ValueError for anything else."""
+    if tuple(value.shape) != shape:
+        raise ValueError(f"an array of shape {tuple(value.shape)} in place of one of {shape}")
+    return value
 
 
 def _distinct(states: list[Any]) -> list[Any]:
@@ -198,15 +249,21 @@ def _take_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     return value
 
 
-def _put_arrays(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def _put_arrays(value: Any, read: Callable[[str], np.ndarray], names: set[str]) -> Any:
+    """Return ``value`` with the arrays in the place of the references to them.
+
+    :param names: of all arrays; those that are read are taken out, so that a small file cannot ask for one many times
+    """
     if isinstance(value, dict):
         if ARRAY in value:
-            if _digest(arrays[value[ARRAY]]) != value["sha256"]:
+            names.remove(value[ARRAY])
+            array = read(value[ARRAY])
+            if _digest(array) != value["sha256"]:
                 raise ValueError(f"{value[ARRAY]} has changed since it was written")
-            return arrays[value[ARRAY]]
-        return {key: _put_arrays(inner, arrays) for key, inner in value.items()}
+            return array
+        return {key: _put_arrays(inner, read, names) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_put_arrays(inner, arrays) for inner in value]
+        return [_put_arrays(inner, read, names) for inner in value]
     return value
 
 

@@ -169,7 +169,7 @@ def load_moment(run_folder: str | Path) -> Moment:
         model.set_logger(Logger(None, []))
         batches = [ReplayBufferSamples(**checkpoint.to_torch(batch)) for batch in tree["batches"]]
         return Moment(model, batches, tree["random"], tree["reason"])
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except checkpoint.MISFIT as error:
         raise files.DamagedFileError(path, f"does not fit its own configuration: {str(error)[:200]}") from error
 
 

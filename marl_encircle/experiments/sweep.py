@@ -10,10 +10,11 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
 
-from marl_encircle import locks
+from marl_encircle import files, locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
+from marl_encircle.experiments.records import MAX_FILE
 from marl_encircle.experiments.train import ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 
@@ -35,12 +36,13 @@ class Running(NamedTuple):
 
     @property
     def world_steps(self) -> int:
-        """World steps at the latest point of its learning curve."""
+        """World steps at the latest point of its learning curve; 0 without one, or where it is not this training's."""
         try:
-            lines = (self.folder / "progress.csv").read_text(encoding="utf-8").splitlines()
-        except FileNotFoundError:
+            lines = files.read_bytes(self.folder / "progress.csv", max_bytes=MAX_FILE).decode().splitlines()
+            steps = int(lines[-1].partition(",")[0])
+        except (ValueError, IndexError):
             return 0
-        return int(lines[-1].partition(",")[0]) if len(lines) > 1 else 0
+        return min(max(steps, 0), self.total)
 
 
 @dataclass

@@ -184,8 +184,11 @@ def _write_curve(run: Path, folder: Path) -> None:
     data = files.read_bytes(run / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE)
     with SummaryWriter(folder) as writer:
         describe(writer, config, record["seed"], CURVES)
-        for row in csv.DictReader(io.StringIO(data.decode())):
-            steps = int(row.pop("world_steps")) * config.scenario.pursuers
-            for name, value in row.items():
-                if value:
-                    writer.add_scalar(f"eval/{name}", float(value), steps)
+        try:
+            for row in csv.DictReader(io.StringIO(data.decode())):
+                steps = int(row.pop("world_steps")) * config.scenario.pursuers
+                for name, value in row.items():
+                    if value:
+                        writer.add_scalar(f"eval/{name}", float(value), steps)
+        except (ValueError, KeyError, TypeError, csv.Error) as error:
+            raise files.DamagedFileError(run / "progress.csv", f"no learning curve: {str(error)[:200]}") from error

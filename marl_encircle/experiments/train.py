@@ -127,9 +127,9 @@ class _Run:
         if saved is not None:
             try:
                 checkpoint.restore(self.model, self.curriculum, saved["training"])
-                self.wall_seconds, self.cpu_seconds = saved["seconds"]
-                self.rows = saved["rows"]
-            except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+                self.wall_seconds, self.cpu_seconds = map(float, saved["seconds"])
+                self.rows = [list(row) for row in saved["rows"]]
+            except checkpoint.MISFIT as error:
                 path = folder / checkpoint.NAME
                 raise files.DamagedFileError(path, f"does not fit this training: {str(error)[:200]}") from error
         self._wall, self._cpu = time.monotonic(), time.process_time()

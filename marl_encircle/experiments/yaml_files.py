@@ -4,7 +4,6 @@ YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a duplicate key
 """
 
 import datetime
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,8 @@ from ruamel.yaml.events import (
     SequenceStartEvent,
 )
 
+from marl_encircle import files
+
 MAX_BYTES = 128_000
 MAX_DEPTH = 20
 MAX_VALUES = 2000
@@ -38,13 +39,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
         mappings, lists, strings, finite numbers, booleans and null
     """
     try:
-        regular = path.is_file() or not path.exists()  # what is no file may never end
-        with path.open("rb") if regular else io.BytesIO() as file:
+        with files.open_regular(path) as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    if not regular:
-        raise ConfigError(f"{path}: not a regular file")
+    except files.DamagedFileError as error:
+        raise ConfigError(str(error)) from error
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{path}: larger than {MAX_BYTES // 1000} kB")
     try:

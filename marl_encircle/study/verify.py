@@ -69,7 +69,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
             path = folder / episodes_name(setting)
             if not path.exists():
                 continue
-            recorded = episodes_from_csv(path.read_text(encoding="utf-8"))
+            recorded = episodes_from_csv(files.read_bytes(path).decode())
             played = play_rounds(policy, config, len(recorded), config.evaluation.seed, setting)
             rounds += len(recorded)
             equal += count_equal(recorded, played, same_processor)

@@ -232,7 +232,7 @@ def test_evaluate_prints_one_object_and_reads_only(run: Run) -> None:
     assert 0 < result["success"] < 1
     low, high = wilson_interval(result["success"], 200)
     assert (result["success_low"], result["success_high"]) == pytest.approx((low, high))
-    assert result["policy_sha256"] == files.sha256_file(folder / "policy.safetensors")
+    assert result["policy_sha256"] == files.sha256_bytes((folder / "policy.safetensors").read_bytes())
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
     assert run("evaluate", folder, "--episodes", "200", "--seed", "77", "--json") == done
     text = run("evaluate", folder, "--episodes", "200", "--seed", "77").out
@@ -263,7 +263,7 @@ def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, 
         assert run("evaluate", folder, *arguments, "--write", "--json").code == 0
         assert (folder / "episodes.csv").read_bytes() == before
     record = json.loads((folder / "run.json").read_text())
-    assert record["sha256"]["episodes.csv"] == files.sha256_file(folder / "episodes.csv")
+    assert record["sha256"]["episodes.csv"] == files.sha256_bytes((folder / "episodes.csv").read_bytes())
     assert everything_in(folder) == everything_in(finished())
 
 

@@ -217,7 +217,7 @@ def rewrite_policy(folder: Path, change: Callable[[dict[str, th.Tensor]], object
     tensors = safetensors.torch.load(path.read_bytes())
     change(tensors)
     path.write_bytes(safetensors.torch.save(tensors))
-    edit_record(folder, lambda record: record["sha256"].update({path.name: files.sha256_file(path)}))
+    edit_record(folder, lambda record: record["sha256"].update({path.name: files.sha256_bytes(path.read_bytes())}))
 
 
 def write(name: str, content: bytes) -> Callable[[Path], object]:

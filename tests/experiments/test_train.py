@@ -65,7 +65,7 @@ def test_a_finished_folder_holds_the_record_and_what_it_vouches_for() -> None:
     assert record["updates"] == 85  # 100 steps of 4 worlds, but for the 15 with random actions
     assert record["cpu_seconds"] > 0
     assert record["wall_seconds"] > 0
-    assert record["sha256"] == {name: files.sha256_file(folder / name) for name in sorted(FILES)}
+    assert record["sha256"] == {name: files.sha256_bytes((folder / name).read_bytes()) for name in sorted(FILES)}
     assert {"python", "numpy", "torch", "stable-baselines3"} <= record["versions"].keys()
     assert len(record["source_hash"]) == 64
 
@@ -539,7 +539,7 @@ def test_a_diverged_training_is_kept_and_shown(
     assert record["world_steps"] == 4 * (when + 1)
     assert everything_in(folder) == ["divergence.safetensors", "policy.safetensors", "progress.csv", "run.json"]
     assert record["sha256"] == {
-        name: files.sha256_file(folder / name) for name in ("policy.safetensors", "progress.csv")
+        name: files.sha256_bytes((folder / name).read_bytes()) for name in ("policy.safetensors", "progress.csv")
     }
     (run,) = read_runs(tmp_path)
     assert run.status == "diverged"
