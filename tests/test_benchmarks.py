@@ -153,3 +153,15 @@ def test_a_difference_has_the_wider_of_both_intervals(spread: Any) -> None:
     # Rounds that agree, seeds that do not: that of the seeds
     spreading = spread.difference([[1.0, 1.0], [2.0, 2.0], [6.0, 6.0]], [[0.0, 0.0]])
     assert spreading["interval"] == pytest.approx(student_interval([1.0, 2.0, 6.0]), abs=1e-3)
+
+
+def test_the_cost_of_event_files_is_that_of_pairs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = load("event_files", monkeypatch)
+    assert min(bench.seconds(5_100, logged) for logged in (False, True)) > 0.0
+    taken = {False: iter([10.0, 10.0, 20.0]), True: iter([10.1, 10.5, 20.4])}  # + 1 %, 5 %, 2 %
+    monkeypatch.setattr(bench, "take_turns", lambda tasks: [next(taken[logged]) for _, logged in tasks])
+    monkeypatch.setattr(sys, "argv", ["event_files.py", "--world-steps", "640", "--pairs", "3"])
+    bench.main()
+    assert capsys.readouterr().out == "2.0 % (1.0, 2.0, 5.0)\n"

@@ -100,7 +100,7 @@ def draw_owners(
     """
     for who, directions in stretches(owner):
         angles = borders(directions, len(owner))
-        fine = np.linspace(angles[0], angles[-1], 6 * len(angles))
+        fine = np.linspace(angles[0], angles[-1], 2 + round(outer * (angles[-1] - angles[0])))  # a pixel each
         unit = np.stack([np.cos(fine), -np.sin(fine)], axis=1)
         outline = np.concatenate([centre + outer * unit, centre + inner * unit[::-1]])
         colour = LINE if who == NOBODY else entity_colour(who, pursuers)

@@ -287,10 +287,15 @@ class _Scene:
         x, y = place[0] - self.centre[0], place[1] - self.centre[1]
         return self.side / 2 + float(x) * self.scale, self.side / 2 - float(y) * self.scale
 
+    def _pixels(self, places: Array) -> list[tuple[float, float]]:
+        """Return the same of many places, (K, 2)."""
+        away = (places - self.centre) * self.scale
+        return list(zip((self.side / 2 + away[:, 0]).tolist(), (self.side / 2 - away[:, 1]).tolist(), strict=True))
+
     def _polar(self, angles: NDArray[np.floating[Any]], distances: Array) -> list[tuple[float, float]]:
         """Return pixels at these angles and distances from the target."""
         distances = np.minimum(distances, 4 * self.view.scenario.half_width)  # far outside of the picture
-        return [self._pixel(place) for place in polar(self.view.target, angles, distances)]
+        return self._pixels(polar(self.view.target, angles, distances))
 
     def _draw_ground(self) -> None:
         self.surface.fill(BACKGROUND)
@@ -322,7 +327,7 @@ class _Scene:
         path = np.stack(self.view.trail)
         for body in range(path.shape[1]):
             colour = pursuer_colour(body) if body < path.shape[1] - 1 else INK
-            pixels = [self._pixel(place) for place in path[:, body]]
+            pixels = self._pixels(path[:, body])
             for age, (start, end) in enumerate(zip(pixels[-2::-1], pixels[:0:-1], strict=True)):
                 fading = (*colour, max(60, 220 - 8 * age))
                 pygame.draw.line(layer, fading, start, end, (3 if age < 6 else 2) * SUPERSAMPLING)
