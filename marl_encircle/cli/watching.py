@@ -108,11 +108,11 @@ def watch(
         raise ConfigError(str(error)) from error
     if save is not None:
         film.check_film(save)
-    if save is None and headless is None:
-        player.check_window()
     given = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles}
     fields = {name: value for name, value in given.items() if value is not None}
     match = find_match(method, versus, out, fields, scene, policy, seed)
+    if save is None and headless is None:
+        player.check_window()
     for note in match.notes():
         typer.echo(note, err=True)
     layers = Layers()._replace(**dict.fromkeys(hide or (), False))

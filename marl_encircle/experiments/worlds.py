@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ import pettingzoo
 from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
-from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+from pettingzoo.env_registry.exceptions import NameNotFound, NamespaceNotFound, PettingZooRegistryError
+from pettingzoo.env_registry.registration import parallel_registry
 
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
 from marl_encircle.experiments.yaml_files import ConfigError, parse_yaml
+from marl_encircle.spelling import nearest
 
 MAX_ROUND = 10_000
 """Steps after which a round counts as one that never ends."""
@@ -61,6 +64,8 @@ def find_world(name: str, arguments: Mapping[str, Any], pad: bool = False) -> Ca
 
     try:
         first = world()
+    except (NameNotFound, NamespaceNotFound) as error:
+        raise ConfigError(f"{name}: not among PettingZoo's environments{nearest(name, parallel_registry)}") from error
     except PettingZooRegistryError as error:
         raise ConfigError(f"{name}: {error}") from error
     except (TypeError, ValueError, AssertionError, ImportError) as error:
@@ -81,13 +86,20 @@ def _find_maker(name: str) -> Callable[..., World]:
     try:
         module = import_module(path)
     except ImportError as error:
-        raise ConfigError(f"{name}: cannot be imported: {error}") from error
+        raise ConfigError(f"{name}: cannot be imported: {error}{_nearest_module(path)}") from error
     finally:
         sys.path.pop(0)
     maker: Callable[..., World] | None = getattr(module, function or "parallel_env", None)
     if maker is None:
         raise ConfigError(f"{name}: the module has no {function or 'parallel_env'}; give module:function")
     return maker
+
+
+def _nearest_module(path: str) -> str:
+    """Return what :func:`nearest` says of a module that its package lacks; nothing where another one is missing."""
+    package = path.rpartition(".")[0]
+    names = [f"{package}.{each.name}" for each in iter_modules(getattr(sys.modules.get(package), "__path__", ()))]
+    return nearest(path, names) if names and path not in names else ""
 
 
 def check_spaces(name: str, world: Any) -> None:

@@ -59,7 +59,9 @@ def test_a_module_of_the_working_folder_is_found(tmp_path: Path, monkeypatch: py
         ("imitation:absent", "the module has no absent; give module:function"),
         ("os.path", "the module has no parallel_env; give module:function"),
         ("no spaces", "neither an id of PettingZoo, such as sisl/multiwalker-v9, nor an import path"),
-        ("nobody/knows-v0", "Namespace 'nobody' not found in registry"),
+        ("nobody/knows-v0", "nobody/knows-v0: not among PettingZoo's environments; known: "),
+        ("sisl/multiwalke-v9", "not among PettingZoo's environments; did you mean sisl/multiwalker-v9?"),
+        ("mpe2.simple_spred_v3", "No module named 'mpe2.simple_spred_v3'; did you mean mpe2.simple_spread_v3?"),
         ("imitation:no_environment", "object is no ParallelEnv; pettingzoo.utils.aec_to_parallel converts an AECEnv"),
     ],
 )
