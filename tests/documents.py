@@ -172,7 +172,8 @@ class Session:
         subprocess.run(patch, cwd=self.changed, input=block.text, text=True, check=True, capture_output=True)
 
     def _bash(self, block: Block) -> None:
-        for line in lines_of(block):
+        for each in lines_of(block):
+            line = each.removeprefix(".venv/bin/")
             if line.startswith("marl-encircle "):
                 self.know(line)
             if not line.startswith(tuple(NOT_RUN)):
