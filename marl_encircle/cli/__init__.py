@@ -20,8 +20,10 @@ from marl_encircle import files, locks
 from marl_encircle.cli import configs, info, machine, playing, results, runs, sweeps, tensorboard, tuning, watching
 from marl_encircle.experiments.yaml_files import ConfigError
 
+NAME = "marl-encircle"
+
 app = typer.Typer(
-    name="marl-encircle",
+    name=NAME,
     help="Encircle a faster target: train, evaluate and compare, and reproduce Zheng et al. (2023).",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -41,7 +43,7 @@ def _add(name: str, command: Callable[..., None], panel: str, *examples: str) ->
     (config_app if group else app).command(
         last,
         help="\n\n".join(escape(re.sub(r"\s+", " ", paragraph)) for paragraph in paragraphs),
-        epilog="\n".join(["[bold]Examples[/bold]", *(f"  marl-encircle {name} {escape(line)}" for line in examples)]),
+        epilog="\n".join(["[bold]Examples[/bold]", *(f"  {NAME} {name} {escape(line)}" for line in examples)]),
         rich_help_panel=panel,
     )(command)
 
@@ -80,7 +82,7 @@ _add("bench", machine.bench, ABOUT, "")
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"marl-encircle {version('marl-encircle')}")
+        typer.echo(f"{NAME} {version(NAME)}")
         raise typer.Exit
 
 
@@ -100,7 +102,7 @@ def main() -> None:
     """Run the command; errors become one message and an exit code."""
     try:
         with _one_telling():
-            app()
+            app(prog_name=NAME)  # also where it is run by python -m
     except Exception as error:
         code = _exit_code(error)
         if code is None or os.environ.get("MARL_ENCIRCLE_DEBUG"):
