@@ -380,13 +380,6 @@ def test_a_small_body_at_the_end_of_the_path_is_seen_from_its_start() -> None:
     assert escaped([(0.0, -0.03)], discs=[(0.0, 0.1045, 0.001)], **thin) == near(0.0, 0.088)
 
 
-def test_the_safety_distance_and_the_ratio_are_those_of_the_world() -> None:
-    sim = arranged([(-0.46, 0.0), (0.5, 0.0)], contacts="off", wall_weight=0.0)
-    sim.state.safety_distance[0] = 0.405
-    sim.state.speed_ratio[0] = 1.0  # samples of 0.01: 0.5 - s >= 0.405 up to 0.09
-    assert push(sim).state.target[0].tolist() == near(0.09, 0.0)
-
-
 def test_the_target_sees_the_pursuers_after_their_move_or_before() -> None:
     # The pursuer goes from (-0.2, 0) to (-0.2, 0.1)
     for order, x, y in (("pursuers_first", 0.2, -0.1), ("simultaneous", 1.0, 0.0)):

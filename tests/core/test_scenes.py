@@ -2,6 +2,7 @@
 
 import os
 import time
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from marl_encircle.core import scenes
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.scenes import SCENES
-from marl_encircle.core.simulator import PlacementError, Simulator
+from marl_encircle.core.simulator import PlacementError, Simulator, State
 
 SEEDS = 1000 if os.environ.get("HYPOTHESIS_PROFILE") == "thorough" else 100
 SHAPES = {
@@ -67,9 +68,74 @@ def test_a_scene_that_returns_no_discs_is_refused_by_name(
         Scenario(scene="wrong")
 
 
-@pytest.mark.parametrize("scenario", SHAPES.values(), ids=SHAPES)
-def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
-    s = drawn(scenario).state
+class Placed(NamedTuple):
+    fits: bool
+    pursuers: list[list[float]]
+    target: list[float]
+    discs: list[list[float]]
+    centres: list[list[float]]
+
+
+def placed(uniforms: list[float], obstacles: int = 1, separated: bool = True) -> Placed:
+    """One world of two pursuers (radius 1/8), a target (1/4), and obstacles of two discs, in a scene 4 wide."""
+    shape = np.array([[1.0, 0.0, 0.5], [0.0, 2.0, 0.25]])
+    world = np.zeros((1, 2, 2)), np.zeros((1, 2)), np.zeros((1, 2 * obstacles, 3)), np.zeros((1, obstacles, 2))
+    rules = {"pursuer_radius": 0.125, "target_radius": 0.25, "half_width": 2.0, "obstacle_limit": 0.8}
+    numbers, radii = np.array([uniforms]), np.array([0.4])
+    fits = scenes.place(np.array([0]), numbers, shape, radii, *rules.values(), separated, *world)
+    return Placed(bool(fits[0]), *(array[0].tolist() for array in world))
+
+
+def near(values: list[list[float]]) -> Any:
+    return [pytest.approx(row, abs=1e-12) for row in values]
+
+
+def test_placement_uses_up_its_random_numbers_in_order() -> None:
+    # Obstacle: 0.8 x 2 x (0.5, -0.25) = (0.8, -0.4), a quarter turned: (1, 0) lies along y, (0, 2) along -x
+    drawn = [*(0.75, 0.375, 0.25), *(0.25, 0.5), *(0.5, 0.75), *(0.375, 0.25)]
+    by_hand = Placed(
+        True,
+        pursuers=near([[0.0, 1.0], [-0.5, -1.0]]),
+        target=pytest.approx([-1.0, 0.0]),
+        discs=near([[0.8, 0.0, 0.2], [0.0, -0.4, 0.1]]),
+        centres=near([[0.8, -0.4]]),
+    )
+    assert placed(drawn) == placed(drawn, separated=False) == by_hand
+    assert not placed(drawn[:-1]).fits
+    assert not placed(drawn[:4], obstacles=2).fits
+
+
+def test_what_does_not_fit_is_drawn_again() -> None:
+    centre, beside = (0.75, 0.375, 0.25), (0.75, 0.5)  # beside: (1, 0), of which the disc at (0.8, 0) is 0.2 away
+    outside = (1.0, 0.375, 0.0)  # the first disc lies at 1.6 + 0.4
+    target, on_it, above = (0.25, 0.5), (0.25, 0.57), (0.5, 0.75)  # on it: 0.28 from the target, which reaches 3/8
+    on_another, below = (0.54, 0.75), (0.375, 0.25)  # 0.16 from the pursuer above, which reaches 1/4
+    fitting = [*centre, *target, *above, *below]
+    retried = [*outside, *centre, *beside, *target, *beside, *on_it, *above, *on_another, *below]
+    assert placed(retried) == placed(fitting)
+    assert not placed(retried[:-2]).fits
+    assert placed([*outside, *fitting], separated=False) == placed(fitting)
+    assert placed([*centre, *beside, *beside, *beside], separated=False).pursuers == [[1.0, 0.0]] * 2
+
+
+def test_obstacles_keep_clear_of_each_other_and_bodies_may_touch() -> None:
+    # Both unturned: discs at (0.4, 0) and (0, 0.8) beside the centre, of radius 0.2 and 0.1
+    first, too_near, other = (0.25, 0.5, 0.0), (0.3, 0.6, 0.0), (0.75, 0.5, 0.0)
+    bodies = (0.5, 0.1, 0.9, 0.9, 0.1, 0.9)
+    assert placed([*first, *too_near, *other, *bodies], obstacles=2) == placed([*first, *other, *bodies], obstacles=2)
+    # A pursuer 3/8 from the target and another 1/4 from the first: their radii, without rounding
+    touching = placed([*first, 0.75, 0.5, 0.75, 0.5 - 3 / 32, 0.75, 0.5 - 5 / 32])
+    assert touching.fits
+    assert touching.pursuers == [[1.0, -0.375], [1.0, -0.625]]
+
+
+@pytest.fixture(scope="module", params=SHAPES.values(), ids=list(SHAPES))
+def shape(request: pytest.FixtureRequest) -> tuple[Scenario, State]:
+    return request.param, drawn(request.param).state
+
+
+def test_nothing_overlaps_at_the_start(shape: tuple[Scenario, State]) -> None:
+    scenario, s = shape
     n, length = scenario.pursuers, scenario.discs // max(scenario.obstacles, 1)
     assert (distances(s.pursuers, s.pursuers)[:, ~np.eye(n, dtype=bool)] >= 2 * scenario.pursuer_radius).all()
     target = s.target[:, None]
@@ -82,9 +148,8 @@ def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
     assert (distances(s.discs, s.discs)[:, others] >= reach[:, others]).all()
 
 
-@pytest.mark.parametrize("scenario", SHAPES.values(), ids=SHAPES)
-def test_everything_starts_within_the_limits_and_at_rest(scenario: Scenario) -> None:
-    s = drawn(scenario).state
+def test_everything_starts_within_the_limits_and_at_rest(shape: tuple[Scenario, State]) -> None:
+    _, s = shape
     assert (np.abs(s.pursuers) <= 1.0).all()
     assert (np.abs(s.target) <= 1.0).all()
     assert (np.abs(s.discs[..., :2]) <= 0.9).all()

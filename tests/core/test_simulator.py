@@ -79,6 +79,15 @@ def test_seeding_again_starts_the_same_rounds_again() -> None:
     assert_same(first, everything(sim))
 
 
+def test_a_placement_draws_the_same_number_of_random_numbers_for_ever() -> None:
+    # Eight times what is needed if all fits at once: 3 for each obstacle, 2 for each of four other bodies
+    sim, stream = Simulator(Scenario(obstacles=2), 1), np.random.default_rng(7)
+    sim.seed([7])
+    sim.reset()
+    stream.random(8 * (3 * 2 + 2 * 4))
+    assert sim.get_state()["streams"] == [stream.bit_generator.state]
+
+
 def test_worlds_without_a_seed_differ_every_time() -> None:
     a, b = Simulator(Scenario(), 2), Simulator(Scenario(), 2)
     assert (a.reset().target_distance != b.reset().target_distance).all()
@@ -89,6 +98,7 @@ def test_the_number_of_seeds_and_of_worlds_is_checked() -> None:
         Simulator(Scenario(), 3).seed([1, 2])
     with pytest.raises(ValueError, match="n_worlds must be at least 1; got 0"):
         Simulator(Scenario(), 0)
+    assert Simulator(Scenario()).n_worlds == 1
 
 
 # Resume
@@ -157,6 +167,14 @@ def test_a_difficulty_acts_from_each_worlds_next_reset_on() -> None:
     sim.reset(np.array([2]))
     assert sim.state.speed_ratio.tolist() == [1.1, 1.3, 1.3]
     assert sim.state.safety_distance.tolist() == [0.11, 0.11, 0.3]
+
+
+def test_the_target_moves_by_the_safety_distance_and_the_ratio_of_its_world() -> None:
+    # The pursuer behind is nearer; samples of 1.0 x 0.01: 0.5 - s >= 0.405 up to 0.09
+    sim = arranged([(-0.46, 0.0), (0.5, 0.0)], contacts="off", wall_weight=0.0)
+    sim.state.safety_distance[0] = 0.405
+    sim.state.speed_ratio[0] = 1.0
+    assert push(sim).state.target[0].tolist() == pytest.approx([0.09, 0.0])
 
 
 @pytest.mark.parametrize(
