@@ -1,15 +1,15 @@
-"""The report in a real browser: ``pytest tests/browser/report_page.py``, behind ``make test-browser``.
+"""The report in a real browser: one of the tests of ``make test-browser``.
 
-Chromium is the one that ``CHROMIUM=`` names, or one on the path; Playwright drives it and is asked to fetch nothing.
-Without either the exit code is 1. ``SCREENSHOTS=folder`` keeps pictures of the page.
+``SCREENSHOTS=folder`` keeps pictures of the page.
 """
+
+from __future__ import annotations  # Playwright may be missing, which the fixture 'browser' tells
 
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -19,34 +19,11 @@ from marl_encircle import files
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.study.report.write import report
 
-try:
-    from playwright.sync_api import Browser, Locator, Page, sync_playwright
-except ImportError:
-    pytest.exit("no Playwright: pip install 'marl-encircle[dev]'", returncode=1)
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 RUNS = Path(__file__).parents[2] / "results" / "runs"
 DESK, PHONE = (1280, 900), (360, 740)
-
-
-def chromium() -> str:
-    """The browser's path; the tests end without one."""
-    wanted = os.environ.get("CHROMIUM")
-    found = shutil.which(wanted) if wanted else next(filter(None, map(shutil.which, NAMES)), None)
-    if found is None:
-        where = f"CHROMIUM={wanted} is no program" if wanted else f"none of {', '.join(NAMES)} is on the path"
-        pytest.exit(f"no Chromium: {where}; apt-get install chromium, or set CHROMIUM=/path/to/it", returncode=1)
-    return found
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    path = chromium()
-    arguments = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=arguments)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="session")
