@@ -43,6 +43,7 @@ MODULES = (
     "files.py",
 )
 TESTS = {
+    "maddpg/maddpg.py": ("maddpg/test_maddpg.py", "maddpg/test_saving.py"),
     "maddpg/matd3.py": ("maddpg/test_maddpg.py",),
     "maddpg/policies.py": ("maddpg/test_networks.py", "maddpg/test_maddpg.py"),
     "experiments/faults.py": ("experiments/test_faults.py", "experiments/test_config.py"),
@@ -52,7 +53,7 @@ TESTS = {
 """Where other files than ``tests/<folder>/test_<name>.py`` are those that should notice."""
 
 COMPILED = ("core/compilation.py",)
-"""All else is tested as plain Python."""
+"""All else is tested as plain Python, without the trainings that take longest: what is sharp notices before them."""
 
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 """Without byte code: two mutants of one size within a second would pass for one file."""
@@ -225,6 +226,7 @@ def command_of(module: str, limit: int | None = None) -> list[str]:
     """
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=line", "--durations=0"]
     plain = f"NUMBA_DISABLE_JIT={int(module not in COMPILED)}"
+    options += [] if module in COMPILED else ["-m", "not slow"]
     limited = [] if limit is None else ["sh", "-c", f'ulimit -t {limit} && exec "$0" "$@"']
     return ["env", plain, *limited, sys.executable, "-m", "pytest", *options, *tests_of(module)]
 

@@ -1,4 +1,5 @@
 import hashlib
+import inspect
 import warnings
 from pathlib import Path
 from typing import Any, ClassVar
@@ -44,6 +45,41 @@ def weights_hash(model: MADDPG) -> str:
     return hashlib.sha256(
         b"".join(tensor.numpy().tobytes() for tensor in model.policy.state_dict().values())
     ).hexdigest()
+
+
+def test_the_defaults_are_those_of_the_documentation() -> None:
+    def defaults(function: Any) -> dict[str, Any]:
+        parameters = inspect.signature(function).parameters.values()
+        return {p.name: p.default for p in parameters if p.default is not p.empty and not p.name.startswith("_")}
+
+    nothing = ("action_noise", "n_agents", "exploration_noise", "max_grad_norm", "policy_kwargs", "seed")
+    assert defaults(MADDPG) == {
+        **dict.fromkeys(nothing),
+        "learning_rate": 1e-3,
+        "buffer_size": 1_000_000,
+        "learning_starts": 100,
+        "batch_size": 1024,
+        "tau": 0.01,
+        "gamma": 0.95,
+        "train_freq": 1,
+        "gradient_steps": 1,
+        "critic": "per_agent",
+        "exploration_random": 0.05,
+        "policy_delay": 1,
+        "actor_regularization": 1e-3,
+    }
+    assert defaults(MATD3) == {"policy_delay": 2, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
+    assert make_model().exploration_noise == 0.3
+    for cls in ALGORITHMS:
+        assert defaults(cls.learn) == {
+            "callback": None,
+            "log_interval": 4,
+            "tb_log_name": cls.__name__,
+            "reset_num_timesteps": True,
+            "progress_bar": False,
+        }
+    assert defaults(MADDPG.train) == {"batch_size": 1024}
+    assert (MADDPG.n_critics, MATD3.n_critics) == (1, 2)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -408,9 +444,20 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
         load(MADDPG, tmp_path / "model.zip", env=LabelledWorlds(n_agents=4))
 
 
-@pytest.mark.parametrize("kwargs", [{"n_steps": 3}, {"replay_buffer_class": DDPG}, {"critic": "central"}], ids=str)
-def test_what_is_not_supported_is_refused(kwargs: dict[str, Any]) -> None:
-    with pytest.raises((ValueError, AssertionError), match=r"n_steps=3|JointReplayBuffer|central"):
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_steps": 3}, "n_steps=3"),
+        ({"replay_buffer_class": DDPG}, "JointReplayBuffer"),
+        ({"critic": "central"}, "central"),
+        ({"policy_delay": 0}, "policy_delay must be at least 1, but got 0"),
+        ({"max_grad_norm": 0.0}, r"max_grad_norm must be positive or None, but got 0\.0"),
+        ({"max_grad_norm": -1.0}, r"max_grad_norm must be positive or None, but got -1\.0"),
+    ],
+    ids=str,
+)
+def test_what_is_not_supported_is_refused(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, AssertionError), match=message):
         make_model(**kwargs)
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import ERRNOS, fail_everywhere, largest_file, temporary_files
+from stable_baselines3 import DDPG
 from test_maddpg import load, make_model, weights_hash
 
-from marl_encircle.maddpg import MADDPG
+from marl_encircle.maddpg import MADDPG, MATD3
+from marl_encircle.maddpg.maddpg import load_actors
 
 
 def names(folder: Path) -> list[str]:
@@ -34,6 +36,18 @@ def test_an_open_file_is_written_to_as_it_is() -> None:
     data.seek(0)
     assert weights_hash(load(MADDPG, data)) == weights_hash(model)  # type: ignore[arg-type]  # SB3 takes both
     assert len(buffer.getvalue()) > 1000
+
+
+def test_the_actors_of_a_saved_model_act_alone(tmp_path: Path) -> None:
+    model = make_model(MATD3, critic="shared", policy_kwargs={"net_arch": [5, 4], "share_parameters": True})
+    model.save(tmp_path / "model.zip")
+    policy = load_actors(tmp_path / "model.zip")
+    obs = np.random.default_rng(0).standard_normal((6, 3)).astype(np.float32)
+    np.testing.assert_array_equal(policy.predict(obs)[0], model.predict(obs)[0])
+    assert (policy.n_agents, policy.critic_kind, policy.training) == (3, "shared", False)
+    DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(tmp_path / "ddpg.zip")
+    with pytest.raises(ValueError, match="not a model of MADDPG"):
+        load_actors(tmp_path / "ddpg.zip")
 
 
 def test_every_call_may_fail(tmp_path: Path) -> None:
