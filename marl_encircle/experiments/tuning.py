@@ -23,6 +23,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor, Process
 from marl_encircle.experiments.grid import Job
+from marl_encircle.experiments.records import MAX_FILE
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
 from marl_encircle.experiments.trials import Outcome, Row, write_outcome
@@ -44,7 +45,7 @@ def tune(
     :param out: folder of the search; gets what :func:`~marl_encircle.experiments.trials.write_outcome` writes, anew
         after each trial
     :param n_workers: trainings at a time
-    :param report: called whenever a trial ends
+    :param report: called whenever a trial starts, goes on after a stop, or ends
     :raises ConfigError: without Optuna
     :raises OtherRunError: if ``out`` holds another search, with the difference
     :raises FolderLockedError: if another search works in ``out``
@@ -154,12 +155,20 @@ class _Attempt:
         return None if record is None else str(record["status"])
 
     def curve(self, job: Job, length: int) -> list[float]:
-        """Return a training's success at each point so far; once it has diverged, 0 at those left of ``length``."""
-        try:
-            text = (self.run(job) / "progress.csv").read_text(encoding="utf-8")
-        except FileNotFoundError:
+        """Return a training's success at each point so far; once it has diverged, 0 at those left of ``length``.
+
+        :raises DamagedFileError: if its learning curve is none
+        """
+        path = self.run(job) / "progress.csv"
+        if not path.exists():
             return []
-        curve = [float(row["success"]) for row in csv.DictReader(io.StringIO(text))]
+        try:
+            text = files.read_bytes(path, max_bytes=MAX_FILE).decode()
+            curve = [float(row["success"]) for row in csv.DictReader(io.StringIO(text))]
+        except (ValueError, KeyError, TypeError, csv.Error) as error:
+            if isinstance(error, files.DamagedFileError):
+                raise
+            raise files.DamagedFileError(path, f"no learning curve: {str(error)[:200]}") from error
         return curve + [0.0] * (length - len(curve)) if self.status(job) == "diverged" else curve
 
 
@@ -209,7 +218,7 @@ class _Search:
             if attempt.curve(job, 0) or attempt.status(job):
                 attempt.started.append(job)
         attempt.waiting = [job for job in attempt.waiting if attempt.status(job) is None]
-        self.active.append(attempt)
+        self._begin(attempt)
 
     def _ask(self) -> None:
         """Draw the values of a new trial."""
@@ -218,7 +227,11 @@ class _Search:
         # Anew each time: what a trial draws depends on the trials before it, not on when the search was stopped.
         seed = len(self.study.get_trials(deepcopy=False))
         self.study.sampler = TPESampler(seed=seed, n_startup_trials=self.space.file.random_trials)
-        self.active.append(self._attempt(self.study.ask(_distributions(self.space))))
+        self._begin(self._attempt(self.study.ask(_distributions(self.space))))
+
+    def _begin(self, attempt: _Attempt) -> None:
+        self.active.append(attempt)
+        self.report(self._rows()[attempt.trial.number])
 
     def _attempt(self, trial: "optuna.Trial") -> _Attempt:
         folder = self.out / "trials" / f"{trial.number:04}"

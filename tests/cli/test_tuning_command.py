@@ -30,7 +30,9 @@ def test_it_prints_the_trials_and_the_command_that_trains_the_best(
     done = run("tune", search_file(tmp_path), "--trials", 2, "--out", "found")
     assert done.code == 0, done.err
     assert [line.split(",")[0] for line in done.err.splitlines()] == [
+        "trial 0: running after 0 points",
         "trial 0: complete after 4 points",
+        "trial 1: running after 0 points",
         "trial 1: complete after 4 points",
     ]
     *table, last = done.out.splitlines()
@@ -116,7 +118,8 @@ def test_a_search_in_processes_stops_cleanly_and_goes_on(run: Run, tmp_path: Pat
     points = curve.read_text()
     done = run("tune", long, "--trials", 1, "--out", out)
     assert done.code == 0, done.err
-    assert done.err.startswith("trial 0: complete after 60 points")
+    assert done.err.startswith("trial 0: running after ")
+    assert "\ntrial 0: complete after 60 points" in done.err
     assert curve.read_text().startswith(points), "it went on, it did not begin again"
     record = read_record(curve.parent)
     assert record["config"]["evaluation"]["seed"] != load_config().evaluation.seed
