@@ -1,4 +1,4 @@
-"""Soak tests: ``make soak``; each prints the promise that it holds and its figure at the end of the session.
+"""Soak tests: ``make soak``; each prints the promise that it holds, its figure, and the command that shows it.
 
 They are not part of ``make test``. All of them together take at most 40 minutes on two cores.
 """
@@ -9,18 +9,20 @@ import pytest
 
 PROMISE = "promise"
 
-Promise = Callable[[str, object, object], None]
+Promise = Callable[..., None]
 
 
 @pytest.fixture
-def promise(record_property: Callable[[str, object], None]) -> Promise:
+def promise(record_property: Callable[[str, object], None], request: pytest.FixtureRequest) -> Promise:
     """Note a figure, to be printed whatever becomes of the test: what is promised, the figure, the one needed.
 
-    Call it before the assertion: a promise that is broken is shown with its figure.
+    Call it before the assertion: a promise that is broken is shown with its figure. The command is that of the test
+    itself unless another one is named.
     """
 
-    def note(text: str, figure: object, needed: object) -> None:
-        record_property(PROMISE, f"{text}: {figure} (needed {needed})")  # a report's properties come from any worker
+    def note(text: str, figure: object, needed: object, command: str = f"pytest {request.node.nodeid}") -> None:
+        # a report's properties come from any worker
+        record_property(PROMISE, f"{text}: {figure} (needed {needed}) | {command}")
 
     return note
 

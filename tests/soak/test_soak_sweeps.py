@@ -114,14 +114,16 @@ def test_kills_of_parent_and_workers_change_no_table_and_repeat_no_run(
     how = ", ".join(f"{number} of {who}s" for who, number in kills.items())
     promise(f"tables and files of runs that {how} killed change", len(differ), 0)
     promise("finished runs that a killed sweep repeated", len(repeated), 0)
+    assert refused is not None
+    second_code, first_pid = refused
+    told = f"process {first_pid} on host {socket.gethostname()}" in (tmp_path / "said.txt").read_text()
+    promise("second sweeps on one folder that are let in, or not told by whom it is taken", int(not told), 0)
     assert code == 0
     assert differ == []
     assert repeated == []
     assert list(out.rglob("checkpoint*")) == []
-    assert refused is not None
-    second_code, first_pid = refused
     assert second_code == 2
-    assert f"process {first_pid} on host {socket.gethostname()}" in (tmp_path / "said.txt").read_text()
+    assert told
 
 
 FULL = """

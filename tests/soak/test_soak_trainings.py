@@ -99,7 +99,7 @@ def test_a_training_with_much_to_save_stops_in_time(tmp_path: Path, number: int,
     assert saved["training"]["world_steps"] >= 500_000
     assert process.returncode == 128 + number
     assert processes_of_group(process.pid) == []
-    assert seconds < 10
+    assert seconds < 60
 
 
 def processes_of_group(group: int) -> list[str]:
