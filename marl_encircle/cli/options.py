@@ -1,6 +1,7 @@
 """Options that several commands have, and what they become.
 
-Commands import what they need when they run: help and completion wait for no torch.
+Commands import what they need when they run: help and completion wait for no torch, nor does the refusal of a wrong
+configuration.
 """
 
 from pathlib import Path

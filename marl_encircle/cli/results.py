@@ -15,9 +15,11 @@ from marl_encircle.experiments.yaml_files import ConfigError
 def tables(grid: GridOption = "committed", out: Results = Path("results")) -> None:
     """Render the tables from the existing runs."""
     from marl_encircle.experiments.grid import load_grid
+
+    wanted = load_grid(grid)
     from marl_encircle.study.reproduce import write_tables
 
-    for path in write_tables(load_grid(grid), out):
+    for path in write_tables(wanted, out):
         typer.echo(str(path))
 
 
@@ -25,20 +27,23 @@ def figures(grid: GridOption = "committed", out: Results = Path("results")) -> N
     """Draw Figures 1 and 3 to 6 from the runs there are."""
     from marl_encircle.experiments.grid import load_grid
 
+    wanted = load_grid(grid)
     try:
         from marl_encircle.study.figures.write import write_figures
     except ImportError as error:
         raise ConfigError(str(error)) from error
-    for path in write_figures(load_grid(grid), out):
+    for path in write_figures(wanted, out):
         typer.echo(str(path))
 
 
 def report_command(grid: GridOption = "committed", out: Results = Path("results")) -> None:
     """Write report.html: tables, learning curves and a player of rounds, in one file that needs no network."""
     from marl_encircle.experiments.grid import load_grid
+
+    wanted = load_grid(grid)
     from marl_encircle.study.report.write import write_report
 
-    typer.echo(str(write_report(load_grid(grid), out)))
+    typer.echo(str(write_report(wanted, out)))
 
 
 def reproduce_tables(
@@ -76,10 +81,12 @@ def verify_results(
     run.
     """
     from marl_encircle.experiments.grid import load_grid
+
+    wanted = load_grid(grid)
     from marl_encircle.study.verify import verify
 
     with tqdm(unit="run", disable=quiet) as bar:
-        found = verify(load_grid(grid), out, lambda done, total: _advance(bar, done, total))
+        found = verify(wanted, out, lambda done, total: _advance(bar, done, total))
     if not found.rounds:
         typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
         raise typer.Exit(3)

@@ -63,10 +63,10 @@ def train_command(
     as_json: AsJson = False,
 ) -> None:
     """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped."""
+    config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
     from marl_encircle.experiments.records import read_record
     from marl_encircle.experiments.train import train
 
-    config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
     folder, worked = train(
         config,
         seed,

@@ -27,10 +27,12 @@ def sweep_command(
     It may be stopped and started again; what is trained already is not trained twice.
     """
     from marl_encircle.experiments.grid import load_grid
+
+    wanted = load_grid(grid).jobs
     from marl_encircle.experiments.live import LiveReport
     from marl_encircle.experiments.sweep import sweep
 
-    wanted, workers = load_grid(grid).jobs, make_executor(executor, address)
+    workers = make_executor(executor, address)
     with LiveReport() as report:
         progress = sweep(wanted, out, jobs, report, workers)
     if as_json:

@@ -43,10 +43,12 @@ def tune_command(
     --reward.
     """
     from marl_encircle.experiments.search_space import load_space
+
+    plan = load_space(space)
     from marl_encircle.experiments.tuning import tune
 
     folder = out or Path("results/tuning") / Path(space).stem
-    outcome = tune(load_space(space), folder, trials, jobs, lambda row: typer.echo(_line(row), err=True))
+    outcome = tune(plan, folder, trials, jobs, lambda row: typer.echo(_line(row), err=True))
     if as_json:
         typer.echo(json.dumps(_as_json(outcome)))
     else:

@@ -31,7 +31,6 @@ from marl_encircle.experiments.faults import explain, naming_files
 from marl_encircle.experiments.overrides import parse_overrides
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, merge
-from marl_encircle.maddpg import ALGORITHMS
 from marl_encircle.spelling import nearest
 
 Profile = Literal["full", "smoke"]
@@ -50,12 +49,6 @@ def _even(value: int) -> int:
     if value % 2:
         raise ValueError("must be even")
     return value
-
-
-def _known_algorithm(name: str) -> str:
-    if name not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm{nearest(name, ALGORITHMS)}")
-    return name
 
 
 def _off_as_empty(value: Any) -> Any:
@@ -105,7 +98,7 @@ class Schedule(Section):
 class AlgorithmConfig(Section):
     """One of ``ALGORITHMS``. ``*_world_steps`` count steps of all pursuers of one world, ``train_freq`` vec steps."""
 
-    name: Annotated[str, AfterValidator(_known_algorithm)]
+    name: str
     critic: Literal["per_agent", "shared"]
     net_arch: Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(max_length=8)]
     learning_rate: Annotated[float, Field(gt=0, le=1)]
@@ -285,6 +278,7 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
     if not reward.active:
         raise ConfigError("reward.terms: all are off; at least one needs a weight")
     _check_networks(config)
+    _check_algorithm(config.algorithm.name)
     return config
 
 
@@ -333,6 +327,14 @@ def _name_of(given: object, kind: str) -> str:
     if not isinstance(given, (str, Path)):
         raise ConfigError(f"{kind} must be a name or the path of a YAML file; got {given!r:.80}")
     return str(given)
+
+
+def _check_algorithm(name: str) -> None:
+    """Refuse an unknown algorithm; last, since PyTorch comes with those that are known, and takes seconds to import."""
+    from marl_encircle.maddpg import ALGORITHMS
+
+    if name not in ALGORITHMS:
+        raise ConfigError(f"algorithm.name: unknown algorithm{nearest(name, ALGORITHMS)}; got {name!r:.80}")
 
 
 def _check_networks(config: Config) -> None:

@@ -64,6 +64,29 @@ print(sorted({SLOW_IMPORTS} & set(sys.modules)))
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
+def test_a_wrong_configuration_is_refused_before_anything_slow_is_imported(tmp_path: Path) -> None:
+    slow = SLOW_IMPORTS - {"numba", "scipy"} | {"scipy.stats"}  # the rules of the world are kernels
+    (tmp_path / "my.yaml").write_text("seeds: nobody\n")
+    code = f"""
+import sys
+from marl_encircle.cli import main
+for line in (
+    "train --reward our", "train --scenario nowhere", "train --set training.n_worlds=0", "config show --pursuers 0",
+    "sweep comitted", "sweep my.yaml", "tables --grid my.yaml", "figures --grid my.yaml", "report --grid my.yaml",
+    "verify-results --grid my.yaml", "tune my.yaml",
+):
+    sys.argv = ["marl-encircle", *line.split()]
+    try:
+        main()
+    except SystemExit as ended:
+        assert ended.code == 2, line
+    assert not {slow} & set(sys.modules), line
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert done.stderr.count("error: ") == 11
+
+
 def test_one_thread_is_all_that_torch_gets(tmp_path: Path) -> None:
     code = (
         "import torch\nfrom marl_encircle.cli import configs\nopen('threads', 'w').write(str(torch.get_num_threads()))"
