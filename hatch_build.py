@@ -1,8 +1,11 @@
 """Build hook: wheel and sdist get record, policy and card of the first training seed of each cell in ``results/runs``.
 
-``marl_encircle.experiments.pretrained`` finds them by name. An editable installation reads ``results/runs`` itself.
+``marl_encircle.experiments.pretrained`` finds them by name. Of a first seed that diverged only the record goes along,
+which the error names: another seed in its place would be a chosen one. An editable installation reads ``results/runs``
+itself.
 """
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -25,5 +28,7 @@ class PretrainedHook(BuildHookInterface):
             seeds = [seed for seed in folders if seed.isdigit()]
             if seeds:
                 first = folders[min(seeds, key=int)]
-                for path in filter(Path.exists, (first / name for name in FILES)):
+                record = json.loads((first / "run.json").read_bytes())
+                names = FILES if record["status"] == "finished" else FILES[:1]
+                for path in filter(Path.exists, (first / name for name in names)):
                     build_data["force_include"][str(path)] = (TARGET / path.relative_to(runs)).as_posix()

@@ -7,11 +7,14 @@ import sys
 import tarfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
+from made_up import episode, write_run
 
+from hatch_build import PretrainedHook
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
-from marl_encircle.experiments.records import read_setting
+from marl_encircle.experiments.records import Cell, Setting, read_record
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "results" / "runs"
@@ -41,9 +44,13 @@ def contents(runs: Path) -> dict[str, bytes]:
 
 def first_runs() -> dict[str, bytes]:
     """What the first training seed of every cell of the repository has to take along."""
-    folders = {find_run(path.parents[2].name, read_setting(path.parents[1]), [RUNS]) for path in RUNS.rglob("run.json")}
-    paths = [folder / name for folder in folders for name in FILES]
+    folders = [min(cell.glob("seed*"), key=lambda path: int(path.name[4:])) for cell in RUNS.glob("*/*")]
+    paths = [folder / name for folder in folders for name in taken_along(folder)]
     return {path.relative_to(RUNS).as_posix(): path.read_bytes() for path in paths}
+
+
+def taken_along(run: Path) -> tuple[str, ...]:
+    return FILES if read_record(run)["status"] == "finished" else ("run.json",)
 
 
 def test_a_wheel_has_the_first_policy_of_every_cell_and_its_card(wheel: Path) -> None:
@@ -51,6 +58,21 @@ def test_a_wheel_has_the_first_policy_of_every_cell_and_its_card(wheel: Path) ->
     assert found == first_runs()
     assert len(found) >= 24
     assert sum(map(len, found.values())) <= 15_000_000
+
+
+def test_of_a_first_seed_that_diverged_only_the_record_goes_along(tmp_path: Path) -> None:
+    runs, target = tmp_path / "results" / "runs", tmp_path / "built"
+    setting = Setting(1.1, 3, 1)
+    for method, status in {"ours": "finished", "ma2019": "diverged"}.items():
+        for seed in (0, 1):
+            write_run(runs, Cell(method, setting), seed, (episode(0, 10),), status=status if seed == 0 else "finished")
+    data: dict[str, Any] = {"force_include": {}}
+    PretrainedHook(str(tmp_path), {}, None, None, str(target), "wheel").initialize("standard", data)
+    cell = "marl_encircle/pretrained/{}/ratio1.1_n3_m1_random/seed0/"
+    ours, ma2019 = (cell.format(method) for method in ("ours", "ma2019"))
+    assert sorted(data["force_include"].values()) == [
+        f"{ma2019}run.json", f"{ours}policy.safetensors", f"{ours}run.json",
+    ]  # fmt: skip
 
 
 def test_a_wheel_built_from_the_sdist_has_the_same(tmp_path: Path, wheel: Path) -> None:

@@ -14,7 +14,7 @@ from marl_encircle.core.scenes import SCENES
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import SettingConfig, load_grid
 from marl_encircle.experiments.library import PACKAGE, reward_names
-from marl_encircle.experiments.records import Cell, Setting, read_setting, run_path
+from marl_encircle.experiments.records import Cell, Setting, read_record, read_setting, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.spelling import nearest
 
@@ -52,7 +52,7 @@ def find_run(method: str, setting: Setting, folders: Sequence[Path]) -> Path:
     """Return the run of a method's first training seed in a setting.
 
     :param folders: of runs, the one to prefer first
-    :raises ConfigError: naming what there is, the nearest, and the command that trains it
+    :raises ConfigError: naming what there is, the nearest, and the command that trains it; or that it diverged
     """
     found = first_run(Cell(method, setting), folders)
     if found is not None:
@@ -80,10 +80,17 @@ def first_run(cell: Cell, folders: Sequence[Path]) -> Path | None:
     """Return the run of a cell's first training seed, or of the cell whose runs it shares; None without one.
 
     :param folders: of runs, the one to prefer first
+    :raises ConfigError: if it diverged: another seed in its place would be one that was chosen
+    :raises DamagedFileError: if its record is not what a run writes
     """
     for folder in folders:
         found = _first_seed(folder, cell) or _first_seed(folder, load_grid("committed").aliases.get(cell, cell))
         if found is not None:
+            if read_record(found)["status"] == "diverged":
+                raise ConfigError(
+                    f"{found}: the first training seed of {cell.method} {in_words(cell.setting)} diverged, so the name "
+                    "stands for no policy; give the folder of a run"
+                )
             return found
     return None
 

@@ -53,6 +53,24 @@ def test_the_first_seed_is_chosen_whatever_it_is_worth(tmp_path: Path) -> None:
     assert find_run("ours", USUAL_SETTING, [tmp_path]) == tmp_path / run_path(OURS, 9)
 
 
+def test_a_first_seed_that_diverged_is_told_and_no_other_is_taken_in_its_place(tmp_path: Path) -> None:
+    diverged = write_run(tmp_path, OURS, 0, None, status="diverged")
+    write_run(tmp_path, OURS, 1, (episode(0, 10),))
+    with pytest.raises(ConfigError) as caught:
+        find_run("ours", USUAL_SETTING, [tmp_path])
+    assert str(caught.value) == (
+        f"{diverged}: the first training seed of ours with 3 pursuers and 1 obstacle at speed ratio 1.1 diverged, so "
+        "the name stands for no policy; give the folder of a run"
+    )
+
+
+def test_a_name_that_shares_the_runs_of_one_that_diverged_is_told_too(tmp_path: Path) -> None:
+    setting = Setting(1.1, 3, 0)
+    diverged = write_run(tmp_path, Cell("ours", setting), 0, None, status="diverged")
+    with pytest.raises(ConfigError, match=f"{diverged}: the first training seed of model_a .* diverged"):
+        find_run("model_a", setting, [tmp_path])
+
+
 def test_an_earlier_folder_is_preferred(tmp_path: Path) -> None:
     near, far = tmp_path / "near", tmp_path / "far"
     write_run(near, OURS, 7, (episode(0, 10),))

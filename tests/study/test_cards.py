@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
 from marl_encircle.experiments.records import Setting, config_hash, read_record, run_path
 from marl_encircle.experiments.train import train
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.cards import CARD, render_card, render_cards
 from marl_encircle.study.reproduce import write_tables
 
@@ -91,7 +93,10 @@ def test_every_committed_policy_that_is_found_by_name_has_the_card_that_it_would
     grid = load_grid("committed")
     cards = render_cards(grid, runs_of(grid, RUNS), RUNS)
     assert cards == {path.relative_to(RUNS).as_posix(): path.read_text() for path in RUNS.rglob(CARD)}
-    found = {find_run(method, setting, [RUNS]) / CARD for method, setting in grid.cells}
+    found = set()
+    for method, setting in grid.cells:
+        with suppress(ConfigError):  # its first seed diverged, which has no card
+            found.add(find_run(method, setting, [RUNS]) / CARD)
     assert found == {RUNS / name for name in cards}
 
 
