@@ -2,7 +2,7 @@
 
 BASE_PYTHON ?= python3
 PIP_ARGS    ?=
-EXTRAS      ?= dev
+EXTRAS      ?= dev,render
 PYTEST_ARGS ?=
 
 REWARD      ?= ours
@@ -122,8 +122,8 @@ figures: $(READY)  ## draw the figures from the runs there are: GRID RESULTS
 report: $(READY)  ## tables, curves and a player of rounds in one HTML file: GRID RESULTS
 	$(CLI) report --grid $(GRID) --out $(RESULTS)
 
-test-browser: $(READY)  ## the report in a real browser (CHROMIUM=, or one on the path)
-	$(PYTHON) -m pytest tests/browser/report_page.py $(PYTEST_ARGS)
+test-browser: $(READY)  ## report and site in a real browser (CHROMIUM=, or one on the path)
+	$(PYTHON) -m pytest tests/browser/report_page.py tests/browser/site_search.py $(PYTEST_ARGS)
 
 calibrate: $(READY)  ## choose the study's scenario by its protocol: JOBS RESULTS
 	$(CLI) calibrate --out $(RESULTS)/calibration --jobs $(JOBS)

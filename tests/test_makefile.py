@@ -35,7 +35,7 @@ def test_every_target_is_phony() -> None:
 @pytest.mark.parametrize("target", sorted(set(TARGETS) - {"help", "clean"}))
 def test_every_target_sets_up_first(target: str) -> None:
     commands = make("-n", "-W", "pyproject.toml", "PIP_ARGS=--offered", target)
-    assert "-m pip install --offered -c constraints.txt -e '.[dev]'" in commands
+    assert "-m pip install --offered -c constraints.txt -e '.[dev,render]'" in commands
 
 
 def test_variables_reach_the_command() -> None:
