@@ -25,6 +25,7 @@ from marl_encircle.experiments.divergence import Diverged, fault
 from marl_encircle.experiments.metrics import Interval, student_interval
 from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import git_commit, versions
+from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.experiments.worlds import MAX_ROUND, NO_END, random_actions
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
@@ -85,17 +86,19 @@ def play_with(
     :param world: makes a new world, see :func:`find_world`
     :param world_steps: steps of all agents of one world
     :param rounds: of the evaluation, none of which was trained on
-    :raises ConfigError: if a round cannot be trained on: agents that end at different steps
+    :raises ConfigError: if a round cannot be trained on: agents that end at different steps; or if so many steps do not
+        fit into this machine's memory
     :raises Diverged: if a loss or a weight is no finite number any more
     """
     env = SuperSuitVecEnv(world, n_worlds)
-    n = env.n_agents
+    n, steps = env.n_agents, min(world_steps + n_worlds, BUFFER_WORLD_STEPS)
+    check_memory({"--world-steps": steps * n * _transition_bytes(env)}, available_memory())
     model = ALGORITHMS[algorithm](
         "MlpPolicy",
         VecMonitor(env),
         n_agents=n,
         learning_rate=LinearSchedule(1e-3, 0.0, 1.0),
-        buffer_size=min(world_steps + n_worlds, BUFFER_WORLD_STEPS) * n,
+        buffer_size=steps * n,
         learning_starts=min(RANDOM_WORLD_STEPS, world_steps // 10) * n,
         batch_size=512,
         gamma=0.95,
@@ -121,6 +124,12 @@ def play_with(
     random = play_rounds(name, world, random_actions(env.action_space), rounds)
     env.close()
     return Played(policy, env.agents, model.num_timesteps // n, returns, random)
+
+
+def _transition_bytes(env: SuperSuitVecEnv) -> int:
+    """Return the memory [bytes] that an agent's transition takes in the replay buffer."""
+    seen, act = (int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space))
+    return 2 * seen * np.dtype(env.observation_space.dtype).itemsize + 4 * (act + 3)
 
 
 class _Guard(BaseCallback):

@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from marl_encircle.experiments.config import Profile, Section
+from marl_encircle.experiments.config import Config, Profile, Section
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Setting
-from marl_encircle.experiments.trainable import check_seed, check_training
+from marl_encircle.experiments.trainable import check_seed, check_training, memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 TUNING_SEEDS = range(900, 1000)
@@ -153,6 +153,15 @@ class Space(NamedTuple):
         overrides = (*f.overrides, *NO_REPORTED_ROUNDS, *changes)
         setting = Setting(**f.setting.model_dump())
         return [Job(f.reward, setting, seed, f.profile, f.scenario, f.algorithm, overrides) for seed in f.seeds]
+
+    @property
+    def largest(self) -> Config:
+        """The training that asks for most memory: each dimension at the end that does, whatever the others are."""
+        values: dict[str, Any] = {}
+        for key, dimension in self.dimensions.items():
+            configs = {end: self.jobs({**values, key: value})[0].config for end, value in enumerate(dimension.ends)}
+            values[key] = dimension.ends[max(configs, key=lambda end: sum(memory_needed(configs[end]).values()))]
+        return self.jobs(values)[0].config
 
     @property
     def base(self) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import MAX_FILE
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
+from marl_encircle.experiments.trainable import check_trainings
 from marl_encircle.experiments.trials import Outcome, Row, write_outcome
 from marl_encircle.experiments.yaml_files import ConfigError
 
@@ -46,7 +47,7 @@ def tune(
         after each trial
     :param n_workers: trainings at a time
     :param report: called whenever a trial starts, goes on after a stop, or ends
-    :raises ConfigError: without Optuna
+    :raises ConfigError: without Optuna; or if so many trainings at a time do not fit into this machine's memory
     :raises OtherRunError: if ``out`` holds another search, with the difference
     :raises FolderLockedError: if another search works in ``out``
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
@@ -57,6 +58,7 @@ def tune(
     except ImportError as error:
         raise ConfigError("a search needs Optuna: pip install 'marl-encircle[tune]'") from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    check_trainings([space.largest] * n_workers, n_workers)
     path = Path(out) / STUDY
     with locks.folder_lock(out):
         try:

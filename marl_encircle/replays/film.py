@@ -14,6 +14,7 @@ from marl_encircle.envs.palette import LINE
 from marl_encircle.envs.pen import SUPERSAMPLING, pygame
 from marl_encircle.envs.render import EVERYTHING, array_of, draw_tall, draw_wide, shrunk
 from marl_encircle.envs.view import Layers
+from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match
 
@@ -65,9 +66,12 @@ def save(path: Path, match: Match, number: int, fps: float, layers: Layers = EVE
 
     :param path: of a ``.gif`` or ``.mp4`` file
     :param fps: steps per second
-    :raises ConfigError: for another ending, or if MP4 is wanted and its extra is missing
+    :raises ConfigError: for another ending, if MP4 is wanted and its extra is missing, or for a round so long that its
+        pictures do not fit into this machine's memory
     """
     check_film(path)
+    n_pictures, size = match.length(number) + 1, array_of(drawing(match, number, 0, layers)).nbytes
+    check_memory({f"--save {path}, {n_pictures} pictures": n_pictures * size}, available_memory())
     if path.suffix.lower() == ".gif":
         files.write_bytes(path, gif(list(pictures(match, number, layers)), fps))
     else:

@@ -14,6 +14,7 @@ from marl_encircle.core.simulator import Simulator, world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.evaluate import WORLDS_AT_ONCE
+from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 Array = NDArray[np.float64]
@@ -151,7 +152,10 @@ def record_first_rounds(policy: MADDPGPolicy, config: Config, n: int, eval_seed:
 def _record(
     policy: MADDPGPolicy, config: Config, seeds: Sequence[int], worlds: list[int], first_round: int, scene: str | None
 ) -> list[Replay]:
-    """Play the rounds of a batch of worlds and record some of them, each to its own end."""
+    """Play the rounds of a batch of worlds and record some of them, each to its own end.
+
+    :raises ConfigError: if the longest that they may be would not fit into this machine's memory
+    """
     scenario = replace(
         config.scenario, n_directions=config.evaluation.n_directions, scene=scene or config.scenario.scene
     )
@@ -161,6 +165,8 @@ def _record(
     sim.seed(seeds)
     observations = arena.reset()
     moments = {world: [_Moment.of(sim, world)] for world in worlds}
+    steps = len(worlds) * scenario.max_cycles
+    check_memory({"scenario.max_cycles": 2 * steps * moments[worlds[0]][0].nbytes}, available_memory())  # and stacked
     rewards: dict[int, list[Array]] = {world: [] for world in worlds}
     playing = worlds
     for _ in range(scenario.max_cycles):
@@ -221,6 +227,12 @@ class _Moment(NamedTuple):
                 for rule, enclosure in sim.measure.enclosure.items()
             },
         )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        arrays = [self.pursuers, self.velocities, self.target]
+        return sum(array.nbytes for array in [*arrays, *(each for e in self.enclosure.values() for each in e)])
 
 
 def _over_time(moments: list[_Moment], rule: Closure) -> Enclosure:

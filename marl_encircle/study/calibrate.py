@@ -27,7 +27,7 @@ from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
-from marl_encircle.experiments.trainable import check_seed
+from marl_encircle.experiments.trainable import check_seed, check_trainings
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.study.paper import reported_cells
 from marl_encircle.study.typeset import markdown
@@ -146,8 +146,11 @@ def calibrate(
     :param out: folder of the calibration; a second call goes on where the first one stopped
     :param n_workers: processes at a time
     :param report: called whenever a run starts or ends
+    :raises ConfigError: if one cannot be trained, or too many at a time for this machine's memory, before anything is
+        written
     :raises CalibrationError: if a training failed or diverged
     """
+    planned: list[Changes] = [{}, *protocol.neighbours]
 
     def trial(changes: Changes) -> Trial:
         folder = Path(out) / "runs" / name_of(changes)
@@ -156,7 +159,8 @@ def calibrate(
             raise CalibrationError(f"{folder}: {len(progress.failed)} trainings failed, {progress.diverged} diverged")
         return _measure(protocol, changes, folder)
 
-    centre, *neighbours = (trial(changes) for changes in ({}, *protocol.neighbours))
+    check_trainings([job.config for changes in planned for job in _jobs(protocol, changes)], n_workers)
+    centre, *neighbours = (trial(changes) for changes in planned)
     trials, best = [centre, *neighbours], centre
     for neighbour in sorted(neighbours, key=lambda trial: trial.distance):
         if neighbour.distance >= centre.distance:

@@ -8,9 +8,11 @@ import pytest
 from tiny_runs import TINY, everything_in, train_in_this_process
 
 from marl_encircle.experiments import grid as grids
+from marl_encircle.experiments import trainable
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.sweep import Progress
+from marl_encircle.experiments.trainable import memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import calibrate as calibration
 from marl_encircle.study.calibrate import (
@@ -104,6 +106,20 @@ def test_no_more_combinations_are_tried_than_the_protocol_allows(
     asked = with_distances(monkeypatch, distances)
     calibrate(protocol.model_copy(update={"combinations": 1}), tmp_path, 1)
     assert asked == list(distances)
+
+
+def test_a_neighbour_that_does_not_fit_into_memory_is_refused_before_the_centre_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = with_distances(monkeypatch, {})
+    (tmp_path / "protocol.yaml").write_text(PROTOCOL.replace("acceleration: 3", "n_directions: 4096"))
+    protocol = load_protocol(str(tmp_path / "protocol.yaml"))
+    centre = sum(memory_needed(load_config("ours", profile="smoke", fields={"obstacles": 0})).values())
+    (tmp_path / "memory.max").write_text(str(centre))
+    monkeypatch.setattr(trainable, "CONTAINER_LIMIT", tmp_path / "memory.max")
+    with pytest.raises(ConfigError, match="GB of memory"):
+        calibrate(protocol, tmp_path / "out", 1)
+    assert asked == []
 
 
 def test_the_distance_is_to_the_papers_cells(
