@@ -94,6 +94,8 @@ def find_side(
     """
     wanted = setting_of({"scene": scene or USUAL_SETTING.scene, **(fields or {})})
     is_folder = not _is_yaml(what) and is_run_path(what)
+    if _is_yaml(what) and not Path(what).is_file():
+        raise ConfigError(f"{what}: no such file")
     if _is_yaml(what) and policy is None:
         raise ConfigError(f"{what} is a reward without a policy: add --policy RUN_DIR, or train one with it")
     if is_folder and policy is not None:

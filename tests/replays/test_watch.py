@@ -32,6 +32,7 @@ from marl_encircle.replays.player import BAR, SPEEDS, Player, timeline
 from marl_encircle.replays.watch import Match, Side, end_of, find_match, find_side, fresh_seed
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
+OURS = Path(__file__).parents[2] / "ablations" / "ours.yaml"
 REWARD = "name: my_idea\nclosure: pursuers\nterms:\n  contributing_angle: 1.0\n"
 
 
@@ -116,6 +117,8 @@ def test_a_reward_is_watched_with_the_policy_of_a_run(tmp_path: Path) -> None:
         ("model_b", {}, "it has none at all"),
         ("ours", {"policy": Path("x")}, "x/run.json: the file is missing"),
         ("nowhere/seed0", {}, "nowhere/seed0/run.json: the file is missing"),
+        ("nowhere.yaml", {"policy": Path("x")}, "nowhere.yaml: no such file"),
+        (str(OURS), {}, "is a reward without a policy: add --policy RUN_DIR"),
     ],
 )
 def test_what_is_not_there_is_named(results: Path, what: str, options: dict[str, Any], said: str) -> None:
