@@ -131,8 +131,9 @@ calibrate: $(READY)  ## choose the study's scenario by its protocol: JOBS RESULT
 verify-results: $(READY)  ## play every committed policy again and compare: GRID RESULTS
 	$(CLI) verify-results --grid $(GRID) --out $(RESULTS)
 
-reproduce-tables: $(READY)  ## the whole road: train, evaluate, render: GRID JOBS RESULTS
+reproduce-tables: $(READY)  ## the whole road: train, evaluate, render tables and figures: GRID JOBS RESULTS
 	$(CLI) reproduce-tables --grid $(GRID) --out $(RESULTS) --jobs $(JOBS)
+	$(CLI) figures --grid $(GRID) --out $(RESULTS)
 
 docs: $(READY)  ## build the documentation into site/
 	$(INSTALL) -q -e '.[docs]'

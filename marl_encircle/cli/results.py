@@ -74,7 +74,7 @@ def reproduce_tables(
 def verify_results(
     grid: GridOption = "committed", out: Results = Path("results"), quiet: Quiet = False, as_json: AsJson = False
 ) -> None:
-    """Play every committed policy's rounds again, render its tables again, and compare. Nothing is written.
+    """Play every committed policy's rounds again, make tables and figures again, and compare. Nothing is written.
 
     On the processor that a run was made on every round must be equal; elsewhere 99.5 % of the rounds, and every cell's
     S must lie within its 99 % binomial interval. Exit code 3 where that does not hold, and where there is no finished
@@ -85,8 +85,11 @@ def verify_results(
     wanted = load_grid(grid)
     from marl_encircle.study.verify import verify
 
-    with tqdm(unit="run", disable=quiet) as bar:
-        found = verify(wanted, out, lambda done, total: _advance(bar, done, total))
+    try:
+        with tqdm(unit="run", disable=quiet) as bar:
+            found = verify(wanted, out, lambda done, total: _advance(bar, done, total))
+    except ImportError as error:
+        raise ConfigError(str(error)) from error
     if not found.rounds:
         typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
         raise typer.Exit(3)

@@ -87,14 +87,14 @@ class Scenario:
     time_step: float = _bounded(0.1, 1e-6)
     max_speed: float = _bounded(1.0, 1e-6)
     dynamics: Literal["second_order", "first_order"] = "second_order"
-    acceleration: float = _bounded(5.0, 1e-6)
+    acceleration: float = _bounded(3.0, 1e-6)
     damping: float = _bounded(0.25, 0.0, 1.0)
     pursuer_mass: float = _bounded(1.0, 1e-6)
     integration: Literal["mpe", "mpe2"] = "mpe"
     contacts: Literal["soft", "hard", "off"] = "soft"
     contact_force: float = _bounded(100.0, 0.0)
     contact_margin: float = _bounded(1e-3, 1e-9)
-    turn_order: Literal["pursuers_first", "simultaneous"] = "pursuers_first"
+    turn_order: Literal["pursuers_first", "simultaneous"] = "simultaneous"
 
     target: str = "repulsion"
     repulsion_power: int = _bounded(2, 1, 2)

@@ -45,7 +45,7 @@ MAX_HEADER_BYTES = 1 << 16
 
 def make_vec_env(
     reward: str | Path = "ours",
-    n_worlds: int = 64,
+    n_worlds: int = 16,
     *,
     scenario: str | Path | Scenario = "default",
     engine: Engine = "native",
@@ -58,7 +58,7 @@ def make_vec_env(
     """Return worlds to train in: ``n_worlds * pursuers`` slots, monitored, with the setting's curriculum.
 
     :param reward: a method's name or the path of its YAML file
-    :param n_worlds: worlds side by side
+    :param n_worlds: worlds side by side: fewer learn more from each step, more take less time for it
     :param scenario: a name in ``configs/scenario/``, the path of a YAML file, or a ``Scenario``
     :param engine: ``native``, fast, or ``supersuit``, the PettingZoo environment through SuperSuit; equal seeds give
         equal trajectories

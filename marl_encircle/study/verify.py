@@ -1,8 +1,8 @@
-"""Are the committed results those of this code? Every policy plays its rounds again, every table is rendered again.
+"""Are the committed results those of this code? Every policy plays its rounds again, tables and figures are made again.
 
 On the processor that a run was made on every round must be equal in every figure. Another one rounds differently, and a
-round may then take another course: there 99.5 % of the rounds must end alike, and every cell's S must lie within the
-99 % binomial interval of the S that is recorded.
+round may then take another course: there 99.5 % of the rounds must end alike, every cell's S must lie within the 99 %
+binomial interval of the S that is recorded, and figures are not compared.
 """
 
 from collections import defaultdict
@@ -31,7 +31,7 @@ class Verification(NamedTuple):
     :param equal: those that ended as recorded; on the run's own processor also with the same figures
     :param cells_off: cells whose S lies outside the interval
     :param exact: whether all runs were made on this processor, so that every round must be equal
-    :param changed: tables that are not what the runs give
+    :param changed: tables, cards and figures that are not what the runs give
     """
 
     rounds: int
@@ -48,11 +48,12 @@ class Verification(NamedTuple):
 
 
 def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] | None = None) -> Verification:
-    """Play every finished run of a grid again and render its tables; nothing is written.
+    """Play every finished run of a grid again and make its tables, and its figures if there are any; write nothing.
 
-    :param results: folder of ``runs/`` and ``tables/``
+    :param results: folder of ``runs/``, ``tables/`` and ``figures/``
     :param report: called with the number of runs verified and of all
     :raises DamagedFileError: if a run is not what its record says
+    :raises ImportError: if there are figures and no Matplotlib
     """
     texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
@@ -80,7 +81,12 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
         if report is not None:
             report(done, len(folders))
     off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())
-    changed = [name for name, text in texts.items() if _read(Path(results) / name) != text.encode()]
+    contents = {name: text.encode() for name, text in texts.items()}
+    if exact and (Path(results) / "figures").is_dir():
+        from marl_encircle.study.figures.write import encode_figures
+
+        contents |= encode_figures(grid, results)
+    changed = [name for name, data in contents.items() if _read(Path(results) / name) != data]
     return Verification(rounds, equal, off, exact, tuple(changed))
 
 

@@ -45,11 +45,11 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
     mine = tmp_path / "mine.yaml"
     mine.write_text("acceleration: 3\nturn_order: simultaneous\n")
     found = {"scenario.acceleration": [5.0, 3.0], "scenario.turn_order": ["pursuers_first", "simultaneous"]}
-    assert json.loads(run("config", "diff", "default", mine, "--json").out) == found
+    assert json.loads(run("config", "diff", "centre", mine, "--json").out) == found
     assert run("config", "diff", "paper", mine).out == "no difference\n"
     found = json.loads(run("config", "diff", "committed", "smoke", "--json").out)
     assert found["profile"] == ["full", "smoke"]
-    assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[900, 901, 902], [900]]
+    assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[0], [900]]
     found = json.loads(run("config", "diff", "full", "smoke", "--json").out)
     assert {key.split(".")[0] for key in found} == {"training", "evaluation"}
     done = run("config", "diff", "ours", mine)
@@ -60,7 +60,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
 SETTINGS = "settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]"
 GRID = "profile: smoke\nshared: []\ngroups: "
 SEARCH = "profile: smoke\nsetting: {speed_ratio: 1.1, pursuers: 3, obstacles: 1}\nseeds: [950]\nlast_points: 1\n"
-PROTOCOL = "reward: ours\nprofile: smoke\nscenario: default\nseeds: [1]\ncombinations: 0\n"
+PROTOCOL = "reward: ours\nprofile: smoke\nscenario: centre\nseeds: [1]\ncombinations: 0\n"
 KINDS = {
     "reward": ("base: ours\nterms: {contraction: 2.0}", "base: ours\nterm: {}", "term: unknown key"),
     "scenario": ("acceleration: 3", "base: paper\nacceleration: -3", "acceleration must be"),

@@ -1,4 +1,4 @@
-"""How bodies move, by numbers worked out by hand. Unless said otherwise dt = 0.1, damping 0.25, v_P = 1."""
+"""How bodies move, by numbers worked out by hand. Unless said otherwise dt = 0.1, damping 0.25, acceleration 5, v_P = 1."""
 
 import math
 
@@ -13,7 +13,7 @@ from marl_encircle.core.dynamics import TARGETS
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
 
-ALONE = {"target": "still", "contacts": "off"}
+ALONE = {"target": "still", "contacts": "off", "acceleration": 5.0}
 
 
 def one(
@@ -392,7 +392,8 @@ def test_the_target_sees_the_pursuers_after_their_move_or_before() -> None:
 @pytest.mark.parametrize("rule", ["literal", "relaxed"])
 @pytest.mark.parametrize("scene", ["random", "concave", "tunnel"])
 def test_a_target_that_moves_is_free_of_everything_afterwards(scene: str, rule: str) -> None:
-    scenario = Scenario(scene=scene, path_rule=rule, obstacles=2, obstacle_radius=0.15, safety_distance=0.12)
+    fields = {"obstacles": 2, "obstacle_radius": 0.15, "safety_distance": 0.12, "turn_order": "pursuers_first"}
+    scenario = Scenario(scene=scene, path_rule=rule, **fields)
     sim, rng = Simulator(scenario, 64, seed=1), np.random.default_rng(1)
     sim.reset()
     moves = 0

@@ -31,7 +31,7 @@ def test_the_defaults_are_those_of_the_notes() -> None:
     assert (s.pursuer_radius, s.target_radius, s.obstacle_radius) == (0.05, 0.05, 0.2)
     assert (s.time_step, s.damping, s.contact_force, s.contact_margin, s.pursuer_mass) == (0.1, 0.25, 1e2, 1e-3, 1.0)
     assert s.max_speed * s.time_step == pytest.approx(0.1)
-    assert (s.path_samples, s.path_rule, s.repulsion_power, s.acceleration) == (10, "literal", 2, 5.0)
+    assert (s.path_samples, s.path_rule, s.repulsion_power, s.acceleration) == (10, "literal", 2, 3.0)
     assert s.safety_distance == pytest.approx(s.pursuer_radius + s.target_radius + 0.01)
     assert s.agents == ("pursuer_0", "pursuer_1", "pursuer_2")
 

@@ -185,7 +185,7 @@ def other(key: str, value: Any) -> Any:
         "dynamics": "first_order",
         "integration": "mpe2",
         "contacts": "off",
-        "turn_order": "simultaneous",
+        "turn_order": "pursuers_first",
         "target": "still",
         "repulsion_from": "surface",
         "path_rule": "relaxed",

@@ -26,13 +26,11 @@ def test_the_smoke_grid_is_two_tiny_cells() -> None:
     assert load_grid("smoke") == Grid((Job("ours", ONE, 900, "smoke"), Job("ma2019", ONE, 900, "smoke")), {})
 
 
-def test_the_committed_grid_has_its_cells_and_tuning_seeds() -> None:
-    grid = load_grid("committed")
-    for obstacles in (0, 1):
-        for method in ("ours", "model_b", "model_a", "ma2019"):
-            seeds = [job.seed for job in grid.jobs if (job.reward, job.setting) == (method, Setting(1.1, 3, obstacles))]
-            assert seeds == ([] if (method, obstacles) == ("model_a", 0) else [900, 901, 902])
-    assert {job.profile for job in grid.jobs} == {"full"}
+def test_the_committed_grid_has_every_cell_of_the_study_and_its_first_seeds() -> None:
+    committed, study = load_grid("committed"), load_grid("all")
+    assert committed.cells == study.cells
+    assert (committed.frozen, committed.elsewhere, committed.aliases) == (study.frozen, study.elsewhere, study.aliases)
+    assert committed.jobs == study.jobs[: len(committed.jobs)]
 
 
 def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
@@ -98,8 +96,8 @@ def test_a_scene_in_which_no_policy_can_play_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
-    grid = load_grid("committed")
-    assert len(grid.cells) == 9
+    grid = load_grid("all")
+    assert len(grid.cells) == 44
     assert Cell("model_a", Setting(1.1, 3, 0)) in grid.cells
 
 

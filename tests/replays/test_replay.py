@@ -44,9 +44,9 @@ def test_success_steps_are_those_of_the_evaluation(method: str) -> None:
 @pytest.mark.parametrize(
     "run",
     [
-        "ours/ratio1.1_n3_m1_random/seed901",
-        "ma2019/ratio1.1_n3_m0_random/seed900",
-        "ours/ratio1.1_n2_m1_random/seed900",
+        "ours/ratio1.1_n3_m1_random/seed0",
+        "ma2019/ratio1.1_n3_m0_random/seed0",
+        "ours/ratio1.1_n2_m1_random/seed0",
     ],
 )
 def test_a_committed_round_is_played_as_it_was_recorded(run: str) -> None:

@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 PROTOCOL = """\
 reward: ours
 profile: smoke
-scenario: default
+scenario: centre
 settings:
   - {speed_ratio: 1.1, pursuers: 3, obstacles: 0}
 seeds: [910]
@@ -155,7 +155,8 @@ def test_the_projects_protocol_is_allowed_and_holds_the_other_cells_out() -> Non
 def test_the_studys_scenario_is_the_calibrations_outcome() -> None:
     chosen = load_config("ours", scenario=str(ROOT / "results" / "calibration" / "scenario.yaml"))
     assert load_config("ours", scenario="paper") == chosen
-    assert chosen != load_config("ours")
+    assert load_config("ours") == chosen, "what learns without naming a scenario does so in the study's"
+    assert load_config("ours", scenario="centre") != chosen
     assert {job.scenario for job in grids.load_grid("all").jobs} == {"paper"}
 
 

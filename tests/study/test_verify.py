@@ -11,6 +11,7 @@ from marl_encircle.experiments.grid import Grid, Job
 from marl_encircle.experiments.records import Setting, episodes_from_csv, episodes_to_csv
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study import verify as verification
+from marl_encircle.study.figures.write import write_figures
 from marl_encircle.study.reproduce import write_tables
 from marl_encircle.study.verify import Verification, is_off, verify
 
@@ -74,6 +75,15 @@ def test_a_table_that_the_runs_do_not_give_is_found(results: Path) -> None:
     assert found.changed == ("tables/table2.md", "tables/table3.csv")
     assert found.equal == found.rounds
     assert not found.passed
+
+
+def test_a_figure_that_the_runs_do_not_give_is_found(results: Path) -> None:
+    write_figures(GRID, results)
+    assert verify(GRID, results).changed == ()
+    picture = results / "figures" / "figure4.svg"
+    picture.write_bytes(picture.read_bytes().replace(b"success", b"failure", 1))
+    (results / "figures" / "figure6.png").unlink()
+    assert set(verify(GRID, results).changed) == {"figures/figure4.svg", "figures/figure6.png"}
 
 
 def test_nothing_is_no_proof(tmp_path: Path) -> None:

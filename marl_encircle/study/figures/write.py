@@ -31,12 +31,18 @@ def write_figures(grid: Grid, results: str | Path) -> list[Path]:
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
-    folder, written = Path(results) / "figures", []
-    for name, figure in draw_figures(grid, Path(results) / "runs").items():
-        for suffix, data in encode(figure).items():
-            files.write_bytes(folder / f"{name}.{suffix}", data)
-            written.append(folder / f"{name}.{suffix}")
-    return written
+    contents = encode_figures(grid, results)
+    for name, data in contents.items():
+        files.write_bytes(Path(results) / name, data)
+    return [Path(results) / name for name in contents]
+
+
+def encode_figures(grid: Grid, results: str | Path) -> dict[str, bytes]:
+    """Return the files of all figures: path below ``results`` -> bytes. Nothing is written."""
+    figures = draw_figures(grid, Path(results) / "runs")
+    return {
+        f"figures/{name}.{suffix}": data for name, figure in figures.items() for suffix, data in encode(figure).items()
+    }
 
 
 def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
