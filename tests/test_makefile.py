@@ -56,4 +56,5 @@ def test_variables_reach_the_command() -> None:
         shown = make("-n", target, "GRID=smoke", "RESULTS=elsewhere")
         assert shown.strip().endswith(f"{target} --grid smoke --out elsewhere")
     shown = make("-n", "reproduce-tables", "GRID=smoke", "RESULTS=elsewhere", "JOBS=3")
-    assert shown.strip().endswith("reproduce-tables --grid smoke --out elsewhere --jobs 3")
+    assert "reproduce-tables --grid smoke --out elsewhere --jobs 3\n" in shown
+    assert shown.strip().endswith("figures --grid smoke --out elsewhere")

@@ -38,6 +38,8 @@ TINY = (
     "evaluation.n_directions=72",
     "scenario.max_cycles=20",  # whose clumsy pursuers succeed now and then:
     "scenario.movement_range_limit=2.0",
+    "scenario.acceleration=5.0",
+    "scenario.turn_order=pursuers_first",
 )
 FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
 

@@ -180,7 +180,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     ("words", "offered"),
     [
         ("train --reward m", ["ma2019", "model_a", "model_b", "model_c"]),
-        ("train --scenario ", ["default", "paper"]),
+        ("train --scenario ", ["centre", "default", "paper"]),
         ("train --algorithm ", ["maddpg", "matd3"]),
         ("train --scene t", ["tunnel"]),
         ("train --engine n", ["native"]),

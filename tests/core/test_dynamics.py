@@ -1,4 +1,4 @@
-"""How bodies move, by numbers worked out by hand. Unless said otherwise dt = 0.1, damping 0.25, acceleration 5, v_P = 1."""
+"""How bodies move, worked out by hand. Unless said otherwise dt = 0.1, damping 0.25, acceleration 5, v_P = 1."""
 
 import math
 

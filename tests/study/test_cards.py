@@ -42,7 +42,7 @@ def test_a_card_has_the_figures_of_its_run() -> None:
         "# Ours with 3 pursuers and 1 obstacle at speed ratio 1.1",
         "| method | `ours`; a round is won once pursuers and obstacles enclose the target together |",
         "| setting | 3 pursuers and 1 obstacle at speed ratio 1.1; scene: random |",
-        "| scenario | `max_cycles=20`, `movement_range_limit=2.0` |",
+        '| scenario | `max_cycles=20`, `movement_range_limit=2.0`, `acceleration=5.0`, `turn_order="pursuers_first"` |',
         # Wilson with z = 1.96 for 150 of 200: (0.75 + 0.0096 -+ 0.0606) / 1.0192
         "| success S | 75.0 %; Wilson's 95 % interval: 68.6 to 80.5 % |",
         "| mean episode length MEL | 20.00 steps, of the rounds won |",
