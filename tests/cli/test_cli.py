@@ -296,6 +296,9 @@ def test_a_diverged_run_is_evaluated_with_a_warning_and_not_written(run: Run, ru
     done = run("evaluate", folder, "--write")
     assert (done.code, done.out) == (2, "")
     assert "is diverged" in done.err
+    done = run("export", folder, "--to", "torch-export", "--out", runs / "actors.pt2", "--json")
+    assert (done.code, json.loads(done.out)["status"]) == (0, "diverged")
+    assert done.err == "warning: this run diverged; its policy is the last one of its training\n"
     assert (everything_in(folder), (folder / "run.json").read_bytes()) == before
 
 
@@ -503,6 +506,15 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
     (tmp_path / "results" / "tables" / "table2.md").write_text("edited")
     done = run("verify-results", *results, "--quiet", "--json")
     assert (done.code, json.loads(done.out)) == (3, {**expected, "passed": False, "changed": ["tables/table2.md"]})
+    done = run("verify-results", *results, "--quiet")
+    assert (done.code, done.out.splitlines()) == (
+        3,
+        [
+            "check: every figure of every round",
+            f"changed: {tmp_path / 'results' / 'tables' / 'table2.md'}",
+            "rounds=16 equal=16 cells_off=0",
+        ],
+    )
 
 
 @pytest.mark.usefixtures("_tiny_workers")

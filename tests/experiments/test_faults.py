@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.yaml_files import ConfigError
 
@@ -46,6 +47,12 @@ def test_a_scenarios_file_is_told_also_where_a_change_would_hide_its_fault(tmp_p
     assert refused(scenario=path).startswith(f"{path}: scenario: too many bodies")
     assert load_config(scenario=path, fields={"obstacles": 2}).scenario.obstacles == 2
     assert refused(scenario=path, fields={"pursuers": 4}).startswith("scenario: too many bodies")
+
+
+def test_a_change_of_a_scenario_that_stands_in_no_file_is_told_by_its_key() -> None:
+    fault = "scenario.accelerat: unknown key; did you mean acceleration?"
+    assert refused(scenario=Scenario(), overrides=["scenario.accelerat=3"]) == fault
+    assert refused(scenario=Scenario(), fields={"accelerat": 3}) == fault
 
 
 def test_every_fault_of_a_file_is_told_at_once() -> None:

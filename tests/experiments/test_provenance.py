@@ -31,3 +31,10 @@ def test_an_installation_does_not_take_a_strangers_commit(monkeypatch: pytest.Mo
     inside.mkdir(parents=True)
     monkeypatch.setattr(provenance, "PACKAGE", inside)
     assert provenance.git_commit() is None
+
+
+def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / ".git").mkdir()
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path / "marl_encircle")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert provenance.git_commit() is None

@@ -29,7 +29,7 @@ from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays import film, player
 from marl_encircle.replays.player import BAR, SPEEDS, Player, timeline
-from marl_encircle.replays.watch import Match, Side, end_of, find_match, find_side, fresh_seed
+from marl_encircle.replays.watch import Match, Side, _in_scene, end_of, find_match, find_side, fresh_seed
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
 OURS = Path(__file__).parents[2] / "ablations" / "ours.yaml"
@@ -132,6 +132,18 @@ def test_a_run_folder_of_another_setting_or_with_a_policy_is_refused() -> None:
         find_side(str(finished()), Path("results"), {"pursuers": 4})
     with pytest.raises(ConfigError, match="its own"):
         find_side(str(finished()), Path("results"), policy=finished())
+
+
+@pytest.mark.parametrize(
+    ("fields", "scene", "said"),
+    [
+        ({"composite_unit": False}, "tunnel", "scene tunnel: the policy of .* sees another number of obstacles"),
+        ({"obstacles": 2, "half_width": 0.4}, "tunnel", "scene tunnel: too many bodies to place"),
+    ],
+)
+def test_a_scene_that_a_policy_cannot_play_in_is_refused(fields: dict[str, Any], scene: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        _in_scene(tiny(**fields), scene, finished())
 
 
 def test_rounds_are_fresh_unless_asked_for_and_it_is_said() -> None:
