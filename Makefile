@@ -54,9 +54,10 @@ soak: $(READY)  ## the promises that take long to see: kills, full disks, long s
 	$(PYTHON) -m pytest -n 2 --dist loadfile --timeout 1200 tests/soak $(PYTEST_ARGS)
 
 coverage: $(READY)  ## lines that the tests run, by module; the kernels as plain Python (PYTEST_ARGS goes to pytest)
-	rm -f .coverage
-	NUMBA_DISABLE_JIT=1 $(PYTHON) -m pytest -n 2 --cov --cov-report= $(PYTEST_ARGS) tests/core tests/envs tests/maddpg
-	$(PYTHON) -m pytest -n 2 --cov --cov-append --cov-report= $(PYTEST_ARGS) \
+	rm -f .coverage .coverage.*
+	NUMBA_DISABLE_JIT=1 $(PYTHON) -m pytest -n 2 --timeout 1200 --cov --cov-report= $(PYTEST_ARGS) \
+	  tests/core tests/envs tests/maddpg
+	$(PYTHON) -m pytest -n 2 --timeout 1200 --cov --cov-append --cov-report= $(PYTEST_ARGS) \
 	  --ignore tests/core --ignore tests/envs --ignore tests/maddpg tests
 	$(BIN)/coverage report --fail-under 95
 
