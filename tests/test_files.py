@@ -49,6 +49,7 @@ def test_writers_write_exactly_what_they_are_given(tmp_path: Path) -> None:
     text = (tmp_path / "new" / "j.json").read_text(encoding="utf-8")
     assert json.loads(text) == {"b": 1, "a": [None, 0.1, "λ"]}
     assert text.index('"b"') < text.index('"a"')
+    assert '"λ"' in text
     assert text.endswith("}\n")
     assert names(tmp_path) == ["b", "new", "t"]
 
@@ -267,12 +268,22 @@ def test_reading_refuses_what_is_missing_large_or_changed(tmp_path: Path) -> Non
         files.read_bytes(path)
     path.write_bytes(OLD)
     assert files.read_bytes(path, sha256=files.sha256_bytes(OLD), max_bytes=len(OLD)) == OLD
+    assert files.read_bytes(path, max_bytes=1000) == OLD
     with pytest.raises(files.DamagedFileError, match="larger than the 3 bytes"):
         files.read_bytes(path, max_bytes=3)
     with pytest.raises(files.DamagedFileError, match="changed since it was written") as caught:
         files.read_bytes(path, sha256=files.sha256_bytes(NEW))
     assert caught.value.path == path
     assert str(path) in str(caught.value)
+
+
+def test_a_pipe_is_refused_at_once_since_nobody_may_ever_write_to_it(tmp_path: Path) -> None:
+    (tmp_path / "f").write_bytes(OLD)
+    with files.open_regular(tmp_path / "f") as file:
+        assert not os.get_blocking(file.fileno())
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(files.DamagedFileError, match="not a regular file"):
+        files.read_bytes(tmp_path / "pipe")
 
 
 def test_no_descriptor_is_left_open(tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ SENSELESS = re.compile(
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 """A line of pytest's summary."""
 
-WAITING = 10
-"""So many times its processor time [s] may a mutant take on the clock: one that waits for ever uses none."""
+WAITING = 30
+"""So many times that may pass on the clock, on a busy machine: a mutant that waits for ever uses no processor time."""
 
 
 class WorkError(Exception):

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from marl_encircle.experiments.yaml_files import ConfigError, merge, parse_yaml, read_yaml
+from marl_encircle.experiments.yaml_files import ConfigError, holds, merge, parse_yaml, read_yaml
 
 
 @pytest.mark.parametrize(
@@ -71,3 +71,9 @@ def test_a_merge_goes_mapping_by_mapping_and_changes_neither() -> None:
     assert base == {"a": {"b": 1, "c": [1]}, "d": {"e": 1}, "f": 1}
     assert override == {"a": {"b": None}, "d": 3, "f": {"g": 1}}
     assert merge({}, {}) == {}
+
+
+def test_there_is_a_value_at_a_path_even_if_it_is_null() -> None:
+    values = {"a": {"b": None}}
+    assert [holds(values, path) for path in ([], ["a"], ["a", "b"])] == [True] * 3
+    assert [holds(values, path) for path in (["b"], ["a", "c"], ["a", "b", "c"])] == [False] * 3

@@ -16,11 +16,11 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger, configure
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
-from marl_encircle.maddpg import MADDPG, MATD3, UntrustedFileWarning
+from marl_encircle.maddpg import MADDPG, MATD3, MADDPGPolicy, UntrustedFileWarning
 
 ALGORITHMS = [MADDPG, MATD3]
 CRITICS = ["per_agent", "shared"]
@@ -260,6 +260,12 @@ def test_others_actions_come_from_the_buffer(critic: str) -> None:
         th.testing.assert_close(q_values[i], model.critic(obs, joint)[0, i])
 
 
+@pytest.mark.parametrize(("critic", "trunks"), [("per_agent", 3), ("shared", 1)])
+def test_critics_are_networks_of_their_own_or_heads_of_one_trunk(critic: str, trunks: int) -> None:
+    (network,) = make_model(critic=critic).critic.networks
+    assert [len(weight) for weight in (*network.weights, network.head_weight)] == [trunks, 3]
+
+
 def test_regularization_pulls_the_logits_to_zero() -> None:
     def mean_logit(actor_regularization: float) -> float:
         model = make_model(actor_regularization=actor_regularization, learning_rate=0.01)
@@ -380,7 +386,11 @@ def test_an_environment_tells_its_agents_through_wrappers() -> None:
 
 
 def test_plain_gymnasium_environments_have_one_agent_each() -> None:
-    assert make_model(env=gym.make("Pendulum-v1")).n_agents == 1
+    model = make_model(env=gym.make("Pendulum-v1"))
+    assert model.n_agents == 1
+    model.set_env(gym.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="n_agents=1, but n_agents=3"):
+        make_model().set_env(gym.make("Pendulum-v1"))
     envs = DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 4)
     assert make_model(env=envs).n_agents == 1
     with pytest.raises(ValueError, match="n_agents=1, but n_agents=4"):
@@ -407,6 +417,8 @@ def test_slots_that_hide_their_agents_are_refused_unless_the_number_is_given() -
     assert make_model(env=HidesAgents(LabelledWorlds()), n_agents=3).n_agents == 3
     with pytest.raises(ValueError, match="12 slots are no whole number of worlds with n_agents=5"):
         make_model(env=HidesAgents(LabelledWorlds()), n_agents=5)
+    with pytest.raises(ValueError, match="12 slots are no whole number of worlds with n_agents=0"):
+        make_model(env=HidesAgents(LabelledWorlds()), n_agents=0)
 
 
 def test_the_bare_supersuit_wrapper_is_refused() -> None:
@@ -497,6 +509,11 @@ def test_predict_refuses_observations_of_some_agents(observation: Any) -> None:
         make_model().predict(observation)
 
 
+def test_what_is_missing_to_predict_is_said_with_its_shape() -> None:
+    with pytest.raises(ValueError, match=r"all 3 agents, shape \(n_worlds \* 3, 3\), but got 4 row"):
+        make_model().predict(np.zeros((4, 3)))
+
+
 def test_actions_are_scaled_to_the_action_space() -> None:
     env = LabelledWorlds()
     env.action_space = spaces.Box(np.array([0, -3], np.float32), np.array([10, -1], np.float32))
@@ -557,6 +574,20 @@ def test_sb3_action_noise_takes_the_place_of_the_default_noise() -> None:
     assert 0 < np.abs(spread).max() < 1e-2
 
 
+def test_sb3_action_noise_is_reset_where_an_episode_ends() -> None:
+    class Noise(NormalActionNoise):
+        def reset(self, *args: Any, **kwargs: Any) -> None:
+            resets.append((args, kwargs))
+
+    resets: list[Any] = []
+    noise = Noise(np.zeros(2), np.full(2, 1e-3))
+    make_model(env=LabelledWorlds(n_worlds=1, n_agents=1), action_noise=noise, learning_starts=0).learn(11)
+    assert resets[-2:] == [((), {})] * 2  # episodes have five steps
+    resets.clear()
+    make_model(env=LabelledWorlds(n_worlds=2), action_noise=VectorizedActionNoise(noise, 6)).learn(6 * 6)
+    assert len(resets) >= 6  # of every slot
+
+
 @pytest.mark.parametrize("cls", ALGORITHMS)
 def test_same_seed_same_weights(cls: type[MADDPG]) -> None:
     def trained(seed: int) -> str:
@@ -594,6 +625,17 @@ def test_a_saved_model_acts_alike_and_learns_on_with_any_number_of_worlds(
     without_env = load(cls, tmp_path / "model.zip")
     obs = np.ones((6, 3), np.float32)
     np.testing.assert_array_equal(without_env.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_a_policy_is_saved_and_loaded_without_its_model_as_in_sb3(tmp_path: Path) -> None:
+    policy = make_model(MATD3, critic="shared", policy_kwargs={"net_arch": [5], "share_parameters": True}).policy
+    policy.save(tmp_path / "policy.pth")
+    loaded = MADDPGPolicy.load(tmp_path / "policy.pth", device="cpu")
+    obs = np.random.default_rng(0).standard_normal((6, 3)).astype(np.float32)
+    np.testing.assert_array_equal(loaded.predict(obs)[0], policy.predict(obs)[0])
+    assert {name: tensor.shape for name, tensor in loaded.state_dict().items()} == {
+        name: tensor.shape for name, tensor in policy.state_dict().items()
+    }
 
 
 def test_load_warns_that_the_file_can_run_code(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 import pytest
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
-from marl_encircle.maddpg.networks import StackedMLP
+from marl_encircle.maddpg.networks import AgentFeatures, StackedMLP
 
 
 def plain_outputs(network: StackedMLP, x: th.Tensor) -> th.Tensor:
@@ -29,7 +31,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("output_dim", [1, 2])
-@pytest.mark.parametrize("net_arch", [[], [4], [4, 6]], ids=str)
+@pytest.mark.parametrize("net_arch", [[], [1], [4], [4, 6]], ids=str)
 @pytest.mark.parametrize("case", CASES)
 def test_stacked_networks_equal_single_ones_in_values_and_gradients(
     case: str, net_arch: list[int], output_dim: int
@@ -123,3 +125,24 @@ def test_weights_start_like_those_of_linear_layers() -> None:
     for parameter, fan_in in [(network.weights[0], 100), (network.biases[0], 100), (network.head_weight, 400)]:
         assert parameter.abs().max().item() == pytest.approx(fan_in**-0.5, rel=0.01)
         assert parameter.mean().item() == pytest.approx(0, abs=0.05 * fan_in**-0.5)
+
+
+class Learnt(BaseFeaturesExtractor):
+    """Four sums of an observation's numbers."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space, features_dim=4)
+        self.linear = nn.Linear(6, 4)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.linear(observations.flatten(1))
+
+
+def test_an_agents_features_are_those_of_its_own_observation() -> None:
+    space, obs = spaces.Box(-1, 1, (2, 3)), th.randn(5, 3, 2, 3)
+    flat, common, own = [FlattenExtractor(space)], [Learnt(space)], [Learnt(space) for _ in range(3)]
+    for extractors, size in ((flat, 6), (common, 4), (own, 4)):
+        features = AgentFeatures(space, extractors, 3)
+        assert features.features_dim == size
+        expected = [extractors[i % len(extractors)](obs[:, i]) for i in range(3)]
+        th.testing.assert_close(features(obs), th.stack(expected, dim=1))
