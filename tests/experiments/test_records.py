@@ -261,8 +261,20 @@ def test_a_configuration_that_nobody_vouches_for_is_refused(tmp_path: Path, valu
         records.read_runs(tmp_path)
 
 
+RESULTS = Path(__file__).parents[2] / "results"
+
+
 def test_the_committed_runs_are_what_they_were() -> None:
-    assert len(records.read_runs(Path(__file__).parents[2] / "results" / "runs")) >= 43
+    assert len(records.read_runs(RESULTS / "runs")) >= 43
+
+
+def test_what_supersuits_worlds_taught_is_what_ours_taught() -> None:
+    reference = RESULTS / "reference" / "supersuit"
+    (run,) = records.read_runs(reference)
+    folder = records.run_path(run.cell, run.seed)
+    assert json.loads((reference / folder / "run.json").read_text())["engine"] == "supersuit"
+    for name in ("policy.safetensors", "progress.csv", "episodes.csv"):
+        assert (reference / folder / name).read_bytes() == (RESULTS / "runs" / folder / name).read_bytes()
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"[" * 100_000, b"9" * 5000, b" " * (1 << 21)])
