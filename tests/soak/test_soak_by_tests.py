@@ -162,6 +162,7 @@ def run_tests(folder: Path, *arguments: str) -> tuple[list[Case], list[int]]:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED), done.stdout + done.stderr
+    sys.stdout.write(done.stdout)  # for pytest, which shows it where something is broken
     root = ElementTree.parse(report).getroot()
     laws = [each.attrib["value"] for each in root.iter("property") if "hypothesis" in each.attrib["name"]]
     return [_case(each) for each in root.iter("testcase")], [_examples(base64.b64decode(law).decode()) for law in laws]
