@@ -80,6 +80,9 @@ def test_the_defaults_are_those_of_the_documentation() -> None:
         }
     assert defaults(MADDPG.train) == {"batch_size": 1024}
     assert (MADDPG.n_critics, MATD3.n_critics) == (1, 2)
+    policy = MADDPG("MlpPolicy", LabelledWorlds(), device="cpu", buffer_size=120).policy
+    for network in (policy.actor.mu, *policy.critic.networks):
+        assert [weight.shape[-1] for weight in network.weights] == [64, 64]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -691,6 +694,25 @@ def test_features_extractors_that_learn_are_an_agents_own() -> None:
         q_values[1].sum(), [extractor.linear.weight for extractor in model.actor.features_extractor.extractors]
     )
     assert [bool(grad.abs().sum() > 0) for grad in grads] == [False, True, False]
+
+
+class NormalisedFeatures(LearntFeatures):
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space)
+        self.linear = th.nn.Sequential(th.nn.BatchNorm1d(3), th.nn.Linear(3, 5))
+
+
+def test_targets_take_over_running_statistics_whatever_tau_is() -> None:
+    policy = make_model(policy_kwargs={"features_extractor_class": NormalisedFeatures}).policy
+    target = weights(policy.actor_target)
+    for model in (policy.actor, policy.critic):
+        for extractor in model.features_extractor.extractors:
+            extractor.linear[0].running_mean.fill_(2.0)
+    policy.update_targets(0.0)
+    for model in (policy.actor_target, policy.critic_target):
+        for extractor in model.features_extractor.extractors:
+            assert extractor.linear[0].running_mean.tolist() == [2.0] * 3
+    assert th.equal(weights(policy.actor_target), target)
 
 
 def test_images_are_seen_by_the_cnn_policy() -> None:
