@@ -21,6 +21,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from marl_encircle.maddpg import MADDPG, MATD3, MADDPGPolicy, UntrustedFileWarning
+from marl_encircle.maddpg.policies import Actor
 
 ALGORITHMS = [MADDPG, MATD3]
 CRITICS = ["per_agent", "shared"]
@@ -639,6 +640,9 @@ def test_a_policy_is_saved_and_loaded_without_its_model_as_in_sb3(tmp_path: Path
     assert {name: tensor.shape for name, tensor in loaded.state_dict().items()} == {
         name: tensor.shape for name, tensor in policy.state_dict().items()
     }
+    policy.actor.save(tmp_path / "actor.pth")
+    actor, joint = Actor.load(tmp_path / "actor.pth", device="cpu"), th.as_tensor(obs).view(2, 3, 3)
+    assert th.equal(actor(joint), policy.actor(joint))
 
 
 def test_load_warns_that_the_file_can_run_code(tmp_path: Path) -> None:
