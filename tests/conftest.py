@@ -5,6 +5,7 @@ kind or by the number of steps, are deselected then, and arithmetic on scalars w
 """
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 
@@ -14,6 +15,9 @@ import numba
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell leaves it in what it starts in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("quick", max_examples=25, deadline=None, derandomize=True, database=None)
 unhurried = [HealthCheck.too_slow, HealthCheck.filter_too_much]

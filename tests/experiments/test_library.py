@@ -58,7 +58,7 @@ def test_a_base_that_leads_back_is_refused(tmp_path: Path) -> None:
     assert refused(path).endswith("circular base; it leads back to this file")
     assert refused(write(tmp_path, "c.yaml", "base: ./c.yaml\n")).endswith("circular base; it leads back to this file")
     (tmp_path / "link.yaml").symlink_to(tmp_path / "link.yaml")
-    assert "cannot be read" in refused(str(tmp_path / "link.yaml"))
+    assert refused(str(tmp_path / "link.yaml")).endswith("not a regular file")
 
 
 def test_bases_do_not_go_on_for_ever(tmp_path: Path) -> None:
