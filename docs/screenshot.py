@@ -19,7 +19,7 @@ def main() -> None:
     chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport=SIZE, device_scale_factor=1.25, color_scheme="light")  # type: ignore[arg-type]
+        page = browser.new_page(viewport=SIZE, device_scale_factor=1.25, color_scheme="light")
         page.goto(REPORT.as_uri())
         for part, label in CHOICES.items():
             page.locator(f'[data-part="{part}"]').select_option(label=label)

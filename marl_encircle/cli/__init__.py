@@ -103,7 +103,7 @@ def main() -> None:
     try:
         with _one_telling():
             app(prog_name=NAME)  # also where it is run by python -m
-    except Exception as error:
+    except Exception as error:  # one that has no exit code of its own is a fault of ours and keeps its traceback
         code = _exit_code(error)
         if code is None or os.environ.get("MARL_ENCIRCLE_DEBUG"):
             raise

@@ -1,4 +1,7 @@
-"""What is made from runs: tables, figures, the report, and the proof that they can be made again."""
+"""What is made from runs: tables, figures, the report, and the proof that they can be made again.
+
+A grid is read before anything slow is imported: what is wrong with it is told at once.
+"""
 
 import json
 from pathlib import Path

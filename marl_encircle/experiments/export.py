@@ -200,14 +200,14 @@ def _from_onnx(data: bytes) -> Act:
 def _to_torchscript(actors: Actors, observations: th.Tensor, description: dict[str, str]) -> bytes:
     out = io.BytesIO()
     with _quiet(), th.no_grad():  # torch deprecates TorchScript in favour of torch.export, and reads it still
-        module = th.jit.trace(actors, observations)  # type: ignore[no-untyped-call]
+        module = th.jit.trace(actors, observations)  # type: ignore[no-untyped-call]  # torch does not type it
         th.jit.save(module, out, _extra_files={"metadata.json": json.dumps(description)})
     return out.getvalue()
 
 
 def _from_torchscript(data: bytes) -> Act:
     with _quiet():
-        module = th.jit.load(io.BytesIO(data))  # type: ignore[no-untyped-call]
+        module = th.jit.load(io.BytesIO(data))  # type: ignore[no-untyped-call]  # torch does not type it
     return _act(module)
 
 

@@ -171,7 +171,7 @@ def play_rounds(name: str, world: Callable[[], World], act: Act, rounds: int) ->
                 break
         else:
             raise ConfigError(f"{name}: {NO_END}")
-    env.close()  # type: ignore[no-untyped-call]
+    env.close()  # type: ignore[no-untyped-call]  # PettingZoo does not type it
     return returns
 
 

@@ -66,7 +66,7 @@ def parse_yaml(text: str) -> Any:
     yaml = YAML(typ="safe", pure=True)
     try:
         _refuse_tricks(yaml, text)
-        value = yaml.load(text)
+        value = yaml.load(text)  # safe: plain data, and the tags have been refused
     except MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(line + _in_short(error.problem or error.context or "")) from error
