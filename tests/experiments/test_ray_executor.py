@@ -129,7 +129,7 @@ def test_without_an_address_all_is_on_loopback_and_ends_with_the_sweep(tmp_path:
     assert process.pid is not None
     try:
         first = run_folder(ENDLESS[0].config, ENDLESS[0].seed, tmp_path)
-        wait_for((first / "progress.csv").exists, 120)
+        wait_for((first / "progress.csv").exists, 600)
         addresses = listening(session_of(process.pid))
         assert addresses
         assert set(addresses) <= {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
@@ -140,7 +140,7 @@ def test_without_an_address_all_is_on_loopback_and_ends_with_the_sweep(tmp_path:
         process.join(12)
         assert process.exitcode == 1, "an uncaught Stopped ends a process with 1"
         assert (first / checkpoint.NAME).exists()
-        wait_for(lambda: session_of(process.pid) == [], 5)
+        wait_for(lambda: session_of(process.pid) == [], 60)
     finally:
         for pid in session_of(process.pid):
             os.kill(pid, signal.SIGKILL)
