@@ -33,7 +33,7 @@ from marl_encircle.experiments.records import Episode
 CONFIDENCE = 0.95
 UNBOUNDED = (-math.inf, math.inf)
 
-Rounds = Mapping["RoundKey", float]
+ValueByRound = Mapping["RoundKey", float]
 
 
 class RoundKey(NamedTuple):
@@ -265,13 +265,13 @@ def share_interval(seed_shares: Sequence[float], rounds: int) -> Interval | None
     return _hull(interval, *wilson_interval(float(np.mean(seed_shares)), rounds), bounds=(0.0, 1.0))
 
 
-def _share(seeds: Sequence[Rounds]) -> Estimate:
+def _share(seeds: Sequence[ValueByRound]) -> Estimate:
     """Estimate of a share."""
     means = [_mean(rounds) for rounds in seeds]
     return Estimate(float(np.mean(means)), share_interval(means, min(map(len, seeds))), len(means))
 
 
-def _estimate(seeds: Sequence[Rounds], bounds: tuple[float, float] = UNBOUNDED) -> Estimate:
+def _estimate(seeds: Sequence[ValueByRound], bounds: tuple[float, float] = UNBOUNDED) -> Estimate:
     """Estimate of a mean; its floor is Student's interval over the distinct rounds, each a mean over the seeds."""
     means = [_mean(rounds) for rounds in seeds]
     mean = float(np.mean(means))
@@ -283,7 +283,7 @@ def _estimate(seeds: Sequence[Rounds], bounds: tuple[float, float] = UNBOUNDED) 
     return Estimate(mean, interval, len(means))
 
 
-def _estimate_if_any(seeds: Sequence[Rounds], bounds: tuple[float, float] = UNBOUNDED) -> Estimate | None:
+def _estimate_if_any(seeds: Sequence[ValueByRound], bounds: tuple[float, float] = UNBOUNDED) -> Estimate | None:
     """Estimate over the seeds that have a value in some round; None without any."""
     seeds = [rounds for rounds in seeds if rounds]
     return _estimate(seeds, bounds) if seeds else None
@@ -292,8 +292,8 @@ def _estimate_if_any(seeds: Sequence[Rounds], bounds: tuple[float, float] = UNBO
 def _difference(
     first: Mapping[int, Sequence[Episode]],
     second: Mapping[int, Sequence[Episode]],
-    values_first: Callable[[Sequence[Episode]], Rounds],
-    values_second: Callable[[Sequence[Episode]], Rounds],
+    values_first: Callable[[Sequence[Episode]], ValueByRound],
+    values_second: Callable[[Sequence[Episode]], ValueByRound],
     bounds: tuple[float, float] = UNBOUNDED,
 ) -> Difference | None:
     """Difference over the common seeds and, within each, over the rounds for which both have a value."""
@@ -312,7 +312,7 @@ def _hull(interval: Interval, *points: float, bounds: tuple[float, float] = UNBO
     return Interval(max(bounds[0], min(interval.low, *points)), min(bounds[1], max(interval.high, *points)))
 
 
-def _by_round(seeds: Sequence[Rounds]) -> dict[RoundKey, list[float]]:
+def _by_round(seeds: Sequence[ValueByRound]) -> dict[RoundKey, list[float]]:
     """Values of each distinct round over the seeds that have one."""
     values: dict[RoundKey, list[float]] = {}
     for rounds in seeds:
@@ -321,7 +321,7 @@ def _by_round(seeds: Sequence[Rounds]) -> dict[RoundKey, list[float]]:
     return values
 
 
-def _mean(rounds: Rounds) -> float:
+def _mean(rounds: ValueByRound) -> float:
     return float(np.mean(list(rounds.values())))
 
 
@@ -329,27 +329,27 @@ def _key(episode: Episode) -> RoundKey:
     return RoundKey(episode.round, episode.seed)
 
 
-def _successes(episodes: Sequence[Episode], closure: Closure) -> Rounds:
+def _successes(episodes: Sequence[Episode], closure: Closure) -> ValueByRound:
     """1 or 0 for each round."""
     return _values(episodes, lambda episode: float(episode.success_step(closure) is not None))
 
 
-def _lengths(episodes: Sequence[Episode], closure: Closure) -> Rounds:
+def _lengths(episodes: Sequence[Episode], closure: Closure) -> ValueByRound:
     """Success step of each successful round [steps]."""
     return _values(episodes, lambda episode: episode.success_step(closure))
 
 
-def _sigmas(episodes: Sequence[Episode]) -> Rounds:
+def _sigmas(episodes: Sequence[Episode]) -> ValueByRound:
     """sigma_c of each round [rad]."""
     return _values(episodes, lambda episode: episode.sigma_c)
 
 
-def _solved_sigmas(episodes: Sequence[Episode], closure: Closure) -> Rounds:
+def _solved_sigmas(episodes: Sequence[Episode], closure: Closure) -> ValueByRound:
     """sigma_c of each successful round [rad]."""
     return _values(episodes, lambda episode: None if episode.success_step(closure) is None else episode.sigma_c)
 
 
-def _values(episodes: Sequence[Episode], value: Callable[[Episode], float | None]) -> Rounds:
+def _values(episodes: Sequence[Episode], value: Callable[[Episode], float | None]) -> ValueByRound:
     """Value of each round that has one."""
     if not episodes:
         raise ValueError("no evaluation rounds")
