@@ -33,7 +33,7 @@ from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.build import make_vec_env
 from marl_encircle.experiments.provenance import cpu_model, git_commit, versions
 from marl_encircle.maddpg import MADDPG
-from marl_encircle.maddpg.policies import CriticKind
+from marl_encircle.maddpg.models import CriticKind
 
 try:
     from mpe2 import simple_tag_v3

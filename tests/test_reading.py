@@ -114,7 +114,7 @@ READERS = {
 ALLOWED = {
     "locks.py": ["open"],  # without waiting, and never to be read as a file
     "core/compilation.py": ["read_bytes"],  # the package's own sources
-    "maddpg/maddpg.py": ["open"],  # to write
+    "maddpg/saving.py": ["open"],  # to write
     "experiments/build.py": ["is_zipfile", "is_zipfile"],  # of what is a file
     "experiments/checkpoint.py": ["safe_open"],  # once it has been opened as a regular file
     "experiments/provenance.py": ["read_bytes", "read_text"],  # the package's own sources, the kernel's list

@@ -30,8 +30,8 @@ from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
-from marl_encircle.maddpg.maddpg import load_actors
 from marl_encircle.maddpg.policies import MADDPGPolicy
+from marl_encircle.maddpg.saving import load_actors
 from marl_encircle.spelling import nearest
 
 Engine = Literal["native", "supersuit"]

@@ -1,9 +1,10 @@
 """MADDPG and MATD3 for Stable-Baselines3."""
 
 from marl_encircle.maddpg.buffers import JointReplayBuffer
-from marl_encircle.maddpg.maddpg import MADDPG, UntrustedFileWarning
+from marl_encircle.maddpg.maddpg import MADDPG
 from marl_encircle.maddpg.matd3 import MATD3
 from marl_encircle.maddpg.policies import MADDPGPolicy
+from marl_encircle.maddpg.saving import UntrustedFileWarning
 
 __all__ = ["ALGORITHMS", "MADDPG", "MATD3", "JointReplayBuffer", "MADDPGPolicy", "UntrustedFileWarning"]
 

@@ -13,8 +13,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from torch.nn import functional
 
+from marl_encircle.maddpg.models import Actor, CentralCritic
 from marl_encircle.maddpg.networks import AgentFeatures, StackedMLP
-from marl_encircle.maddpg.policies import Actor, CentralCritic
 
 PLAIN = {Actor, CentralCritic, StackedMLP, AgentFeatures, FlattenExtractor}
 PLAIN |= {nn.Flatten, nn.ModuleList, nn.ParameterList, nn.ReLU}

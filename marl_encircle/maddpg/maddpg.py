@@ -3,9 +3,8 @@
 import io
 import pathlib
 import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar, cast
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -15,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -29,16 +27,13 @@ from stable_baselines3.common.utils import FloatSchedule, should_collect_more_st
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from torch import nn
 
-from marl_encircle import files
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
-from marl_encircle.maddpg.policies import Actor, CentralCritic, CnnPolicy, CriticKind, MADDPGPolicy, MlpPolicy
+from marl_encircle.maddpg.models import Actor, CentralCritic, CriticKind
+from marl_encircle.maddpg.policies import CnnPolicy, MADDPGPolicy, MlpPolicy
+from marl_encircle.maddpg.saving import UntrustedFileWarning, whole_file
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
-
-
-class UntrustedFileWarning(UserWarning):
-    """A file that can run code is about to be read."""
 
 
 class MADDPG(OffPolicyAlgorithm):
@@ -440,7 +435,7 @@ class MADDPG(OffPolicyAlgorithm):
         :param include: attributes to save although SB3 leaves them out
         :raises OSError: with the file's name; the former file is unchanged
         """
-        with _whole(path, ".zip") as target:
+        with whole_file(path, ".zip") as target:
             super().save(target, exclude, include)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -449,7 +444,7 @@ class MADDPG(OffPolicyAlgorithm):
         :param path: the file, with the suffix ``.pkl`` if it has none
         :raises OSError: with the file's name; the former file is unchanged
         """
-        with _whole(path, ".pkl") as target:
+        with whole_file(path, ".pkl") as target:
             super().save_replay_buffer(target)
 
     @classmethod
@@ -489,46 +484,6 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
-
-
-def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
-    """Return the policy of a zip-file that ``save`` of MADDPG or a subclass wrote, to act with: no critic is loaded.
-
-    **Such a file can run code when it is loaded: load only files that you trust.**
-
-    :param path: the file
-    :raises ValueError: if it is no zip-file, or not of such a model; unpickling it may raise anything else
-    """
-    data, parameters, _ = load_from_zip_file(path, device="cpu")
-    needed = ("policy_class", "observation_space", "action_space", "n_agents", "critic_kind", "policy_kwargs")
-    if not data or "policy" not in parameters or not data.keys() >= set(needed):
-        raise ValueError("not a model of MADDPG")
-    policy: MADDPGPolicy = data["policy_class"](
-        data["observation_space"],
-        data["action_space"],
-        lambda _: 0.0,
-        n_agents=data["n_agents"],
-        critic=data["critic_kind"],
-        **data["policy_kwargs"],
-    )
-    saved = cast(dict[str, th.Tensor], parameters["policy"])
-    prefix = "actor."
-    policy.actor.load_state_dict({name.removeprefix(prefix): saved[name] for name in saved if name.startswith(prefix)})
-    policy.set_training_mode(False)
-    return policy
-
-
-@contextmanager
-def _whole(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> Iterator[io.BufferedIOBase]:
-    """Yield a file for SB3 to save to, which becomes ``path`` in the end; an open one is yielded itself."""
-    if isinstance(path, io.BufferedIOBase):
-        yield path
-        return
-    path = pathlib.Path(path)
-    path = path if path.suffix else path.with_name(path.name + suffix)
-    # Opened here: SB3 would leave it open where the disk is full.
-    with files.atomic_path(path) as temporary, temporary.open("wb") as file:
-        yield file
 
 
 def count_agents(env: GymEnv | None, n_agents: int | None) -> int:

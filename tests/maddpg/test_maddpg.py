@@ -21,7 +21,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from marl_encircle.maddpg import MADDPG, MATD3, MADDPGPolicy, UntrustedFileWarning
-from marl_encircle.maddpg.policies import Actor
+from marl_encircle.maddpg.models import Actor
 
 ALGORITHMS = [MADDPG, MATD3]
 CRITICS = ["per_agent", "shared"]

@@ -11,7 +11,7 @@ from stable_baselines3 import DDPG
 from test_maddpg import load, make_model, weights_hash
 
 from marl_encircle.maddpg import MADDPG, MATD3
-from marl_encircle.maddpg.maddpg import load_actors
+from marl_encircle.maddpg.saving import load_actors
 
 
 def names(folder: Path) -> list[str]:
