@@ -40,12 +40,13 @@ help:  ## list the targets and the variables
 	      "SCENE=$(SCENE) SEED=$(SEED)"
 	@echo "  JOBS=$(JOBS) GRID=$(GRID) RESULTS=$(RESULTS) PIP_ARGS=$(PIP_ARGS) PYTEST_ARGS=$(PYTEST_ARGS)"
 
-setup: $(READY)  ## make .venv with the versions of constraints.txt: EXTRAS, PIP_ARGS for pip
+setup: $(READY)  ## make .venv with the versions of constraints.txt, or add EXTRAS to it; PIP_ARGS for pip
+	@[ "$$(cat $(READY))" = '$(EXTRAS)' ] || { $(INSTALL) -e '.[$(EXTRAS)]' && echo '$(EXTRAS)' > $(READY); }
 
 $(READY): pyproject.toml constraints.txt
 	$(BASE_PYTHON) -m venv .venv
-	$(PYTHON) -m pip install $(PIP_ARGS) -c constraints.txt -e '.[$(EXTRAS)]'
-	@touch $@
+	$(INSTALL) -e '.[$(EXTRAS)]'
+	@echo '$(EXTRAS)' > $@
 
 test: $(READY)  ## the tests (PYTEST_ARGS goes to pytest)
 	$(PYTHON) -m pytest -n 2 $(PYTEST_ARGS)

@@ -12,11 +12,13 @@ TEXT = (ROOT / "Makefile").read_text(encoding="utf-8")
 TARGETS = re.findall(r"^([a-z][a-z0-9-]*):", TEXT, flags=re.MULTILINE)
 
 
-def make(*arguments: str) -> str:
+def make(*arguments: str, folder: Path = ROOT) -> str:
     """Output of make; ``-n`` among the arguments shows the commands without running them."""
     command = ["make", "--no-print-directory", *arguments]
     environment = {"PATH": os.environ["PATH"]}  # not the variables of the make that runs the tests
-    result = subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True, timeout=60)
+    result = subprocess.run(
+        command, cwd=folder, env=environment, check=True, capture_output=True, text=True, timeout=60
+    )
     return result.stdout
 
 
@@ -36,6 +38,19 @@ def test_every_target_is_phony() -> None:
 def test_every_target_sets_up_first(target: str) -> None:
     commands = make("-n", "-W", "pyproject.toml", "PIP_ARGS=--offered", target)
     assert "-m pip install --offered -c constraints.txt -e '.[dev,render]'" in commands
+
+
+def test_setup_adds_extras_to_what_is_there_and_else_does_nothing(tmp_path: Path) -> None:
+    interpreter = tmp_path / ".venv" / "bin" / "python"
+    interpreter.parent.mkdir(parents=True)
+    interpreter.write_text('#!/bin/sh\necho "$@" >> calls\n')
+    interpreter.chmod(0o755)
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for arguments in ([], [], ["EXTRAS=tune"], ["EXTRAS=tune"]):
+        make("setup", "BASE_PYTHON=true", *arguments, folder=tmp_path)
+    calls = (tmp_path / "calls").read_text().splitlines()
+    assert calls == [f"-m pip install -c constraints.txt -e .[{extras}]" for extras in ("dev,render", "tune")]
 
 
 def test_variables_reach_the_command() -> None:
