@@ -32,7 +32,7 @@ ScenarioOption = Annotated[
         metavar="RULES",
         autocompletion=names_of("scenario"),
         rich_help_panel=SETTING,
-        help="The world's rules: default, paper (the study's), or a YAML file.",
+        help="The world's rules: default (those of paper, the study's), centre, or a YAML file.",
     ),
 ]
 # Those that are not given are the scenario's own.
