@@ -75,7 +75,9 @@ def diff(
     of_first, of_second = find_kinds(first), find_kinds(second)
     kinds = [kind for kind in of_first if kind in of_second]
     if not kinds:
-        raise ConfigError(f"{first} is a {of_first[0]} and {second} a {of_second[0]}: they cannot be compared")
+        raise ConfigError(
+            f"{first} ({of_first[0]}) and {second} ({of_second[0]}) cannot be compared: two of one kind can"
+        )
     pairs: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
         pairs |= differing(check(kind, first), check(kind, second))

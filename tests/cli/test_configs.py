@@ -54,7 +54,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
     assert {key.split(".")[0] for key in found} == {"training", "evaluation"}
     done = run("config", "diff", "ours", mine)
     assert (done.code, done.out) == (2, "")
-    assert done.err == f"error: ours is a reward and {mine} a scenario: they cannot be compared\n"
+    assert done.err == f"error: ours (reward) and {mine} (scenario) cannot be compared: two of one kind can\n"
 
 
 SETTINGS = "settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]"
