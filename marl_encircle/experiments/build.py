@@ -71,6 +71,8 @@ def make_vec_env(
     :param fields: fields of ``Scenario`` that differ from it, for example ``pursuers=3, obstacles=1, speed_ratio=1.1``
     :raises ConfigError: for an unknown name or a value that is not allowed
     """
+    if "n_envs" in fields:
+        raise ConfigError("n_envs counts slots, one for each pursuer of each world: give n_worlds")
     config = load_config(reward, profile=profile, scenario=scenario, fields=fields, overrides=overrides)
     _check_integer("n_worlds", n_worlds, least=1)
     if seed is not None:

@@ -121,6 +121,7 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
         ({"overrides": ["training.n_world=3"]}, "did you mean n_worlds?"),
         ({"engine": "nativ"}, "engine 'nativ': unknown engine; did you mean native?"),
         ({"engine": None}, "engine None: unknown engine; known: native, supersuit"),
+        ({"n_envs": 8}, "n_envs counts slots, one for each pursuer of each world: give n_worlds"),
         ({"n_worlds": "8"}, "n_worlds must be an integer of at least 1; got '8'"),
         ({"n_worlds": 0}, "n_worlds must be an integer of at least 1; got 0"),
         ({"n_worlds": 2.0}, "n_worlds must be an integer of at least 1; got 2.0"),
