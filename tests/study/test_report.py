@@ -157,6 +157,11 @@ def test_nothing_but_the_paper_is_referred_to_and_nothing_can_be_fetched(runs: P
 
 
 @pytest.mark.usefixtures("_tiny_grid")
+def test_the_number_of_the_only_training_seed_is_not_taken_for_how_many_there_are(runs: Path) -> None:
+    assert "<dt>training seeds</dt><dd>one, number 900</dd>" in report(load_grid("smoke"), runs / "runs")
+
+
+@pytest.mark.usefixtures("_tiny_grid")
 def test_the_rounds_are_the_first_of_the_first_seed_and_end_as_recorded(runs: Path, tmp_path: Path) -> None:
     data = data_in(report(load_grid("smoke"), runs / "runs"))
     [run] = read_runs(runs / "runs")

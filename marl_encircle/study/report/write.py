@@ -62,9 +62,10 @@ def _facts(grid: Grid, runs: Sequence[Run]) -> list[tuple[str, str]]:
     """Say what the report is made of."""
     finished = [run for run in runs if run.status == "finished"]
     rounds = sorted({len(run.episodes) for run in finished})
+    seeds = sorted({job.seed for job in grid.jobs})
     facts = [
         ("runs", f"{len(finished)} of {len(grid.jobs)} finished"),
-        ("training seeds", " ".join(map(str, sorted({job.seed for job in grid.jobs})))),
+        ("training seeds", " ".join(map(str, seeds)) if len(seeds) > 1 else f"one, number {seeds[0]}"),
         ("evaluation", f"{' or '.join(map(str, rounds))} rounds per run" if rounds else "not run"),
     ]
     return facts if grid.frozen is None else [*facts, ("recipe frozen in", grid.frozen[:12])]
