@@ -107,8 +107,13 @@ def main() -> None:
         code = _exit_code(error)
         if code is None or os.environ.get("MARL_ENCIRCLE_DEBUG"):
             raise
-        typer.echo(str(error) if code > 128 else f"error: {error}", err=True)
+        typer.echo(_written_out(str(error) if code > 128 else f"error: {error}"), err=True)
         raise SystemExit(code) from None
+
+
+def _written_out(message: str) -> str:
+    """Return a message without what would steer a terminal: part of it may come from a stranger's file."""
+    return "".join(each if each.isprintable() or each == "\n" else repr(each)[1:-1] for each in message)
 
 
 @contextmanager

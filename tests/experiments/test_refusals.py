@@ -102,6 +102,13 @@ def test_a_bad_override(refused: Any, override: str, reason: str) -> None:
     assert reason in refused("train", "--set", override)
 
 
+def test_what_would_steer_a_terminal_is_written_out(refused: Any, tmp_path: Path) -> None:
+    (tmp_path / "case.yaml").write_text('base: ours\n"\\e[2J\\u202e": 1\n')
+    message = refused("train", "--reward", "case.yaml")
+    assert r"reward.\x1b[2J\u202e: unknown key" in message
+    assert message.replace("\n", "").isprintable()
+
+
 def test_what_this_machines_memory_does_not_hold(refused: Any) -> None:
     message = refused(
         "train", "--set", "training.world_steps=9999999999", "--set", "algorithm.buffer_world_steps=9999999999"
