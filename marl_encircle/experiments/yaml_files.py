@@ -26,6 +26,8 @@ from marl_encircle import files
 MAX_BYTES = 128_000
 MAX_DEPTH = 20
 MAX_VALUES = 2000
+MAX_BITS = 10_000
+"""Of an integer; beyond, Python does not write it out in a message. A float holds 1024."""
 
 
 class ConfigError(ValueError):
@@ -112,6 +114,7 @@ def _check_plain(value: Any, path: str) -> None:
     if isinstance(value, dict):
         for key, inner in value.items():
             if not isinstance(key, str):
+                _check_size(key, where)
                 raise ConfigError(f"{where}keys must be strings; got {key!r:.80}")
             _check_plain(inner, f"{path}.{key}" if path else key)
     elif isinstance(value, list):
@@ -123,6 +126,12 @@ def _check_plain(value: Any, path: str) -> None:
         raise ConfigError(f"{where}must be finite; got {value}")
     elif not isinstance(value, (str, int, float, bool, type(None))):
         raise ConfigError(f"{where}{value!r:.80} is not a plain value")
+    _check_size(value, where)
+
+
+def _check_size(value: Any, where: str) -> None:
+    if isinstance(value, int) and value.bit_length() > MAX_BITS:
+        raise ConfigError(f"{where}an integer of {value.bit_length()} bits; at most {MAX_BITS}")
 
 
 def merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from typing import Any
 
 LONG = "x" * 5000
 DIGITS = "9" * 3000
+HEXADECIMAL = "0x" + "f" * 5000  # reading it costs nothing, but Python does not write it out as digits
 
 REWARD_FILES: list[tuple[str | bytes, str]] = [
     # no mapping
@@ -48,6 +49,8 @@ REWARD_FILES: list[tuple[str | bytes, str]] = [
     ("base: ours\nscale: 1e999\n", "scale: must be finite; got inf"),
     ("base: ours\nterms: {time: [.nan]}\n", "terms.time[0]: must be finite; got nan"),
     (f"base: ours\nscale: {'9' * 5000}\n", "not valid YAML: Exceeds the limit"),
+    (f"base: ours\nscale: {HEXADECIMAL}\n", "scale: an integer of 20000 bits; at most 10000"),
+    (f"base: ours\nterms:\n  ? {HEXADECIMAL}\n  : 1\n", "terms: an integer of 20000 bits; at most 10000"),
     # base
     ("base: our\n", "base: reward 'our': neither a known name nor a .yaml path; did you mean ours?"),
     ("base: [ours]\n", "base must be a name or a path; got ['ours']"),
@@ -106,6 +109,8 @@ OVERRIDES: list[tuple[str, str]] = [
     ("training.n_worlds=[1", "--set training.n_worlds=[1: line 1"),
     ("training.n_worlds=!!int 3", "the tag tag:yaml.org,2002:int is not allowed"),
     ("training.n_worlds=2020-01-01", "2020-01-01 is read as a date"),
+    (f"training.n_worlds={HEXADECIMAL}", "an integer of 20000 bits; at most 10000"),
+    (f"training.curriculum=[{HEXADECIMAL}]", "[0]: an integer of 20000 bits; at most 10000"),
     ("training.n_worlds=", "training.n_worlds: input should be a valid integer; got None"),
     # the algorithm
     ("algorithm.learningrate=0.1", "algorithm.learningrate: unknown key; did you mean learning_rate?"),
