@@ -127,7 +127,9 @@ class SearchFile(Section):
     def _tuning_seeds(cls, seeds: list[int]) -> list[int]:
         for i, seed in enumerate(seeds):
             if seed not in TUNING_SEEDS:
-                raise ValueError(f"seed {seed} is no tuning seed: those are {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}")
+                raise ValueError(
+                    f"seed {seed!r:.80} is no tuning seed: those are {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}"
+                )
             if seed in seeds[:i]:
                 raise ValueError(f"seed {seed} stands there twice")
         return seeds

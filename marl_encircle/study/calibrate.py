@@ -51,7 +51,7 @@ class Protocol(Section):
     settings: Annotated[list[SettingConfig], Field(min_length=1)]
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=1 << 32)]], Field(min_length=1)]
     neighbours: list[Annotated[dict[str, Any], Field(min_length=1, max_length=1)]]
-    combinations: Annotated[int, Field(ge=0)]
+    combinations: Annotated[int, Field(ge=0, le=MAX_SCENARIOS)]
 
     @property
     def cells(self) -> list[Cell]:

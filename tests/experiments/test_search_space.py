@@ -127,6 +127,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "nothing": ({"search": "{}"}, "search: nothing to search"),
     "a reported seed": ({"seeds": "[0]"}, "seed 0 is no tuning seed: those are 900 to 999"),
     "the evaluation's": ({"seeds": "[1000]"}, "seed 1000 is no tuning seed"),
+    "a long number": ({"seeds": f"[{'9' * 2000}]"}, f"seed {'9' * 80} is no tuning seed"),
     "a seed twice": ({"seeds": "[950, 950]"}, "seed 950 stands there twice"),
     "no seeds": ({"seeds": "[]"}, "seeds: "),
     "too many points": ({"last_points": "5"}, "last_points: a learning curve has 4 points; got 5"),

@@ -176,6 +176,7 @@ def test_the_papers_cells_are_those_with_numbers() -> None:
     ("old", "new", "message"),
     [
         ("combinations: 2", "combinations: 13", "17 scenarios; at most 16 may be tried"),
+        ("combinations: 2", f"combinations: {'9' * 2000}", f"less than or equal to 16; got {'9' * 80}$"),
         ("pursuers: 3", "pursuers: 7", "the paper has no numbers of ours in"),
         ("reward: ours", "reward: model_c", "the paper has no numbers of model_c in"),
         ("{contacts: hard}", "{contacts: no}", "scenario.contacts must be one of soft, hard, off; got 'no'"),
