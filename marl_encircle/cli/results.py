@@ -5,7 +5,7 @@ A grid is read before anything slow is imported: what is wrong with it is told a
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from tqdm import tqdm
@@ -13,6 +13,9 @@ from tqdm import tqdm
 from marl_encircle.cli.options import Address, AsJson, ExecutorOption, GridOption, Jobs, Quiet, Results, make_executor
 from marl_encircle.cli.printing import exit_if_failed
 from marl_encircle.experiments.yaml_files import ConfigError
+
+if TYPE_CHECKING:
+    from marl_encircle.experiments.grid import Grid
 
 
 def tables(grid: GridOption = "committed", out: Results = Path("results")) -> None:
@@ -22,6 +25,7 @@ def tables(grid: GridOption = "committed", out: Results = Path("results")) -> No
     wanted = load_grid(grid)
     from marl_encircle.study.reproduce import write_tables
 
+    _warn_of_no_runs(wanted, out)
     for path in write_tables(wanted, out):
         typer.echo(str(path))
 
@@ -35,6 +39,7 @@ def figures(grid: GridOption = "committed", out: Results = Path("results")) -> N
         from marl_encircle.study.figures.write import write_figures
     except ImportError as error:
         raise ConfigError(str(error)) from error
+    _warn_of_no_runs(wanted, out)
     for path in write_figures(wanted, out):
         typer.echo(str(path))
 
@@ -46,6 +51,7 @@ def report_command(grid: GridOption = "committed", out: Results = Path("results"
     wanted = load_grid(grid)
     from marl_encircle.study.report.write import write_report
 
+    _warn_of_no_runs(wanted, out)
     typer.echo(str(write_report(wanted, out)))
 
 
@@ -106,6 +112,14 @@ def verify_results(
         typer.echo(f"rounds={found.rounds} equal={found.equal} cells_off={found.cells_off}")
     if not found.passed:
         raise typer.Exit(3)
+
+
+def _warn_of_no_runs(grid: "Grid", out: Path) -> None:
+    from marl_encircle.experiments.records import run_path
+
+    runs = out / "runs"
+    if not any((runs / run_path(job.config.cell, job.seed)).is_dir() for job in grid.jobs):
+        typer.echo(f"warning: {runs} has no run of this grid; what is made shows none", err=True)
 
 
 def _advance(bar: Any, done: int, total: int) -> None:

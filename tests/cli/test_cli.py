@@ -396,6 +396,15 @@ def test_figures_without_matplotlib_end_with_2_and_what_to_install(
     assert everything_in(tmp_path) == before
 
 
+@pytest.mark.parametrize("name", ["tables", "figures", "report"])
+def test_a_folder_without_runs_of_the_grid_is_warned_of(run: Run, tmp_path: Path, name: str) -> None:
+    done = run(name, "--grid", "smoke", "--out", tmp_path / "mistyped")
+    assert (done.code, done.err) == (
+        0,
+        f"warning: {tmp_path / 'mistyped' / 'runs'} has no run of this grid; what is made shows none\n",
+    )
+
+
 def test_an_unknown_layer_ends_with_2_and_the_nearest_name(run: Run) -> None:
     done = run("watch", "--hide", "lenses")
     assert (done.code, done.out) == (2, "")
@@ -488,6 +497,7 @@ def test_reproduce_tables_ends_with_its_counts(run: Run, tmp_path: Path) -> None
     listed = run("tables", "--grid", "smoke", "--out", results)
     cards = (results / "runs").rglob("README.md")
     assert (listed.code, sorted(map(Path, listed.out.split()))) == (0, sorted([*tables, *cards]))
+    assert listed.err == ""
     (folder / "episodes.csv").write_text("edited")
     for damaged in (run("tables", "--grid", "smoke", "--out", results), run(*arguments)):
         assert damaged.code == 3
