@@ -11,7 +11,7 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid, load_grid
 from marl_encircle.experiments.grid_runs import runs_of
-from marl_encircle.experiments.records import episodes_name
+from marl_encircle.experiments.records import episodes_name, read_record
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
@@ -54,9 +54,17 @@ def reproduce(
     evaluated = 0
     for job in grid.jobs:
         folder = run_folder(job.config, job.seed, runs)
+        if not (folder / "run.json").exists():
+            continue
+        hashes = read_record(folder)["sha256"]
         settings = (None, *grid.elsewhere.get(job.setting, ()))
-        missing = [setting for setting in settings if not (folder / episodes_name(setting)).exists()]
-        if (folder / "run.json").exists() and missing:
+        # Whatever is stopped between the rounds and their record leaves rounds without a hash.
+        missing = [
+            setting
+            for setting in settings
+            if (name := episodes_name(setting)) not in hashes or not (folder / name).exists()
+        ]
+        if missing:
             policy, config, record = load_run(folder)
             if record["status"] == "finished":
                 e = config.evaluation

@@ -67,10 +67,10 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
         exact &= same_processor
         closure = config.reward.closure
         for setting in (None, *grid.elsewhere.get(config.cell.setting, ())):
-            path = folder / episodes_name(setting)
-            if not path.exists():
+            name = episodes_name(setting)
+            if name not in record["sha256"]:
                 continue
-            recorded = episodes_from_csv(files.read_bytes(path).decode())
+            recorded = episodes_from_csv(files.read_bytes(folder / name).decode())
             played = play_rounds(policy, config, len(recorded), config.evaluation.seed, setting)
             rounds += len(recorded)
             equal += count_equal(recorded, played, same_processor)

@@ -111,6 +111,24 @@ def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
     assert not (tmp_path / "tables" / "table_scenes.md").exists()
 
 
+@pytest.mark.parametrize("left", ["all of them", "half of one"])
+def test_rounds_whose_record_was_not_written_any_more_are_played_again(tmp_path: Path, left: str) -> None:
+    (tmp_path / "grid.yaml").write_text(ELSEWHERE)
+    grid = load_grid(str(tmp_path / "grid.yaml"))
+    reproduce(str(tmp_path / "grid.yaml"), tmp_path, 1)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    [rounds] = tmp_path.rglob("episodes_*.csv")
+    record = json.loads((rounds.parent / "run.json").read_text())
+    del record["sha256"][rounds.name]
+    files.write_json(rounds.parent / "run.json", record)
+    if left == "half of one":
+        rounds.write_text("round,se")
+    write_tables(grid, tmp_path)
+    assert verify(grid, tmp_path).passed
+    reproduce(str(tmp_path / "grid.yaml"), tmp_path, 1)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def test_an_edited_row_is_found(tmp_path: Path) -> None:
     reproduce("smoke", tmp_path, 1)
     path = folders(tmp_path)[0] / "episodes.csv"
