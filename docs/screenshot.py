@@ -9,13 +9,11 @@ from playwright.sync_api import sync_playwright
 ROOT = Path(__file__).parents[1]
 REPORT, PICTURE = ROOT / "results" / "report.html", ROOT / "docs" / "images" / "report.png"
 SIZE = {"width": 1060, "height": 1200}
-CHOICES = {"setting": "3 pursuers, 1 obstacle, λ = 1.1", "method": "Ours", "other": "Ma"}
-BEFORE_THE_END = 3
-"""Steps."""
+CHOICES = {"setting": "2 pursuers, 1 obstacle, λ = 1.1", "method": "Ours", "other": "Model B"}
 
 
 def main() -> None:
-    """Choose two methods, go to a moment shortly before the end, and take the picture of the player."""
+    """Choose two methods, go to the end of the round, and take the picture of the player."""
     chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
@@ -24,8 +22,6 @@ def main() -> None:
         for part, label in CHOICES.items():
             page.locator(f'[data-part="{part}"]').select_option(label=label)
         page.locator('[data-part="stage"]').press("End")
-        for _ in range(BEFORE_THE_END):
-            page.keyboard.press("ArrowLeft")
         page.locator("h1").click()
         page.locator("#player").screenshot(path=str(PICTURE))
         browser.close()
