@@ -230,6 +230,18 @@ def test_a_cell_that_shares_runs_points_to_its_owner() -> None:
     assert (own["runsOf"], len(own["rounds"]), own["rounds"][0]["recorded"]) == (None, 1, 4)
 
 
+def test_what_is_shown_first_is_ours_where_one_obstacle_has_to_help_few_pursuers() -> None:
+    rounds = [Played(played(), 3)]
+    settings = [Setting(1.1, 5, 1), Setting(1.1, 2, 1), Setting(1.1, 2, 0), Setting(1.1, 3, 1)]
+    shown = [
+        ShownCell(Cell(method, each), "run", 0, rounds=rounds) for method in ("ma2019", "ours") for each in settings
+    ]
+    data = player_data([*shown, ShownCell(Cell("ours", Setting(1.1, 1, 1)), "not run")])
+    first = data["start"]
+    assert data["methods"][first["method"]] == "Ours"
+    assert data["settings"][first["setting"]]["label"] == "2 pursuers, 1 obstacle, λ = 1.1"
+
+
 @pytest.mark.usefixtures("_tiny_grid")
 def test_missing_runs_are_shown_as_not_run(runs: Path, tmp_path: Path) -> None:
     page = report(load_grid("smoke"), runs / "runs")

@@ -134,11 +134,11 @@ def player_data(cells: Sequence[ShownCell]) -> dict[str, Any]:
 
 
 def _start(cells: Sequence[ShownCell], methods: Sequence[str], settings: Sequence[Setting]) -> dict[str, int]:
-    """Say what is shown first: Ours if it has rounds, with one obstacle and many pursuers."""
+    """Say what is shown first: Ours if it has rounds, with few pursuers and the one obstacle that has to help them."""
     played = [each.cell for each in cells if each.rounds]
     if not played:
         return {"method": 0, "setting": 0}
-    first = min(played, key=lambda cell: (cell.method != "ours", cell.setting.obstacles != 1, -cell.setting.pursuers))
+    first = min(played, key=lambda cell: (cell.method != "ours", cell.setting.obstacles != 1, cell.setting.pursuers))
     return {"method": methods.index(first.method), "setting": settings.index(first.setting)}
 
 
