@@ -38,7 +38,7 @@ help:  ## list the targets and the variables
 	@echo
 	@echo "  REWARD=$(REWARD) SPEED_RATIO=$(SPEED_RATIO) PURSUERS=$(PURSUERS) OBSTACLES=$(OBSTACLES)" \
 	      "SCENE=$(SCENE) SEED=$(SEED)"
-	@echo "  JOBS=$(JOBS) GRID=$(GRID) RESULTS=$(RESULTS) PIP_ARGS=$(PIP_ARGS) PYTEST_ARGS=$(PYTEST_ARGS)"
+	@echo "  JOBS=$(JOBS) GRID=$(GRID) RESULTS=$(RESULTS) EXTRAS=$(EXTRAS) PIP_ARGS=$(PIP_ARGS) PYTEST_ARGS=$(PYTEST_ARGS)"
 
 setup: $(READY)  ## make .venv with the versions of constraints.txt, or add EXTRAS to it; PIP_ARGS for pip
 	@[ "$$(cat $(READY))" = '$(EXTRAS)' ] || { $(INSTALL) -e '.[$(EXTRAS)]' && echo '$(EXTRAS)' > $(READY); }
