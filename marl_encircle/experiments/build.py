@@ -272,5 +272,5 @@ def config_of(record: dict[str, Any], folder: Path) -> Config:
     """
     try:
         return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise files.DamagedFileError(folder / "run.json", f"config: {str(error)[:500]}") from error

@@ -299,9 +299,9 @@ def read_record(folder: Path) -> dict[str, Any]:
     data = files.read_bytes(path, max_bytes=MAX_RUN_JSON)
     try:
         record = json.loads(data)
+        reason = _fault(record)
     except (ValueError, RecursionError) as error:
         raise files.DamagedFileError(path, f"not valid JSON: {error}") from error
-    reason = _fault(record)
     if reason is not None:
         raise files.DamagedFileError(path, reason)
     return cast(dict[str, Any], record)

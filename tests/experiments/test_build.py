@@ -225,6 +225,10 @@ def write(name: str, content: bytes) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_bytes(content)
 
 
+def nested(depth: int) -> dict[str, Any]:
+    return {"weight": nested(depth - 1) if depth else 1.0}
+
+
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (lambda f: f.rename(f.with_name("gone")), "run.json: the file is missing"),
     "no record": (lambda f: (f / "run.json").unlink(), "run.json: the file is missing"),
@@ -246,6 +250,9 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "seed null": (lambda f: edit_record(f, lambda r: r.update(seed=None)), "run.json: seed is None, not"),
     "a status": (lambda f: edit_record(f, lambda r: r.update(status="x")), "run.json: status is 'x', not"),
     "unknown key": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(x=1)), "reward.x: unknown key"),
+    "terms deep down": (
+        lambda f: edit_record(f, lambda r: r["config"]["reward"]["terms"].update(time=nested(600))),
+        "run.json: config: "),
     "nan": (lambda f: edit_record(f, lambda r: r["config"]["reward"].update(scale=math.nan)), "reward.scale: "),
     "huge": (lambda f: edit_record(f, lambda r: r["config"]["algorithm"].update(net_arch=[4096] * 8)), "net_arch: the"),
     "no hashes": (lambda f: edit_record(f, lambda r: r.pop("sha256")), "run.json: missing sha256"),
