@@ -186,7 +186,7 @@ KEYS: tuple[Key, ...] = (
     Key((pygame.K_c,), "c", "contributing angles", lambda player: player.toggle_layer("angles")),
     Key((pygame.K_r,), "r", "enclosed area R_m", lambda player: player.toggle_layer("area")),
     Key((pygame.K_t,), "t", "trails", lambda player: player.toggle_layer("trails")),
-    Key((pygame.K_z,), "z", "magnifier", lambda player: player.toggle_layer("lens")),
+    Key((pygame.K_z,), "z", "lens", lambda player: player.toggle_layer("lens")),
     Key((pygame.K_h,), "h", "this help", Player.toggle_help),
     Key((pygame.K_q, pygame.K_ESCAPE), "q", "quit, as esc", Player.stop),
 )
