@@ -9,9 +9,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
+import numpy as np
 import pytest
 from documents import NOT_RUN, PAGES, ROOT, Session, blocks_of, lines_of, small
 from filelock import FileLock
+from PIL import Image
 
 __all__ = ["small"]
 
@@ -40,6 +42,10 @@ def test_a_page_runs_from_top_to_bottom(
         if not block.not_run:
             session.run(block)
     session.finish()
+    for drawn in Path().glob("*.png"):
+        with Image.open(drawn) as now, Image.open(DOCS / "images" / drawn.name) as shown:
+            difference = np.abs(np.asarray(now, float) - np.asarray(shown, float))
+        assert difference.mean() < 0.1, f"the page shows another {drawn.name} than it draws"
 
 
 def test_every_command_that_is_not_run_stands_on_a_page() -> None:
