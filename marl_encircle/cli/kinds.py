@@ -22,7 +22,7 @@ from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.search_space import SearchFile, load_space
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.spelling import nearest
-from marl_encircle.study.calibrate import Protocol, load_protocol
+from marl_encircle.study.protocol import Protocol, load_protocol
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 

@@ -64,6 +64,9 @@ def reproduce_tables(
     as_json: AsJson = False,
 ) -> None:
     """Train and evaluate what is missing of a grid, and render Tables 1-4 beside the paper's numbers."""
+    from marl_encircle.experiments.grid import load_grid
+
+    load_grid(grid)
     from marl_encircle.experiments.live import LiveReport
     from marl_encircle.study.reproduce import reproduce
 

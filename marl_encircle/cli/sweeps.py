@@ -57,10 +57,12 @@ def calibrate_command(
     What is missing is trained, so that it can be stopped and started again. OUT gets the runs, the sensitivity table
     and the chosen scenario.
     """
-    from marl_encircle.experiments.live import LiveReport
-    from marl_encircle.study.calibrate import calibrate, load_protocol
+    from marl_encircle.study.protocol import load_protocol
 
     plan = load_protocol(protocol)
+    from marl_encircle.experiments.live import LiveReport
+    from marl_encircle.study.calibrate import calibrate
+
     with LiveReport() as report:
         calibrate(plan, out, jobs, report)
     typer.echo((out / "sensitivity.md").read_text(encoding="utf-8"))

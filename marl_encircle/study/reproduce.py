@@ -15,10 +15,10 @@ from marl_encircle.experiments.records import episodes_name, read_record
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
-from marl_encircle.study.calibrate import calibrated_cells
 from marl_encircle.study.cards import render_cards
 from marl_encircle.study.cells import gather
 from marl_encircle.study.paper import reported_cells
+from marl_encircle.study.protocol import calibrated_cells
 from marl_encircle.study.scenes import SCENE_TABLES, render_scenes
 from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, frozen_note, render_table1, render_tables
 

@@ -73,7 +73,8 @@ from marl_encircle.cli import main
 for line in (
     "train --reward our", "train --scenario nowhere", "train --set training.n_worlds=0", "config show --pursuers 0",
     "sweep comitted", "sweep my.yaml", "tables --grid my.yaml", "figures --grid my.yaml", "report --grid my.yaml",
-    "verify-results --grid my.yaml", "tune my.yaml",
+    "verify-results --grid my.yaml", "tune my.yaml", "calibrate my.yaml", "reproduce-tables --grid my.yaml",
+    "config validate my.yaml --kind grid", "config validate nowhere", "config diff our my.yaml",
 ):
     sys.argv = ["marl-encircle", *line.split()]
     try:
@@ -84,7 +85,7 @@ for line in (
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
-    assert done.stderr.count("error: ") == 11
+    assert done.stderr.count("error: ") == 16
 
 
 def test_one_thread_is_all_that_torch_gets(tmp_path: Path) -> None:

@@ -15,17 +15,8 @@ from marl_encircle.experiments.sweep import Progress
 from marl_encircle.experiments.trainable import memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import calibrate as calibration
-from marl_encircle.study.calibrate import (
-    MAX_SCENARIOS,
-    Protocol,
-    Result,
-    Trial,
-    calibrate,
-    load_protocol,
-    name_of,
-    paper_cells,
-    render,
-)
+from marl_encircle.study.calibrate import Trial, calibrate, render
+from marl_encircle.study.protocol import MAX_SCENARIOS, Protocol, Result, load_protocol, name_of, paper_cells
 
 ROOT = Path(__file__).parents[2]
 PROTOCOL = """\
