@@ -47,9 +47,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except files.DamagedFileError as error:
         raise ConfigError(str(error)) from error
-    if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: larger than {MAX_BYTES // 1000} kB")
     try:
+        _check_length(data)  # before it is decoded: its last character may be cut
         value = parse_yaml(data.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
@@ -65,6 +64,7 @@ def parse_yaml(text: str) -> Any:
 
     :raises ConfigError: see :func:`read_yaml`
     """
+    _check_length(text)
     yaml = YAML(typ="safe", pure=True)
     try:
         _refuse_tricks(yaml, text)
@@ -78,6 +78,11 @@ def parse_yaml(text: str) -> Any:
         raise ConfigError(f"not valid YAML: {_in_short(str(error) or type(error).__name__)}") from error
     _check_plain(value, "")
     return value
+
+
+def _check_length(text: str | bytes) -> None:
+    if len(text) > MAX_BYTES:
+        raise ConfigError(f"larger than {MAX_BYTES // 1000} kB")
 
 
 def _in_short(reason: str) -> str:

@@ -185,6 +185,7 @@ ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"algorithm": 3}, "algorithm must be a name or the path of a YAML file; got 3"),
     ({"scenario": b"default"}, "scenario must be a name or the path of a YAML file; got b'default'"),
     ({"overrides": "scenario.damping=0.3"}, "overrides must be a list of section.key=value; got 'scenario.damping"),
+    ({"overrides": ["reward.name=" + "x" * 128_001]}, "larger than 128 kB"),
     ({"overrides": None}, "overrides must be a list of section.key=value; got None"),
     ({"overrides": [3]}, "overrides must be a list of section.key=value; one is 3"),
     ({"fields": {"pursuers": float("nan")}}, "scenario.pursuers must be an integer; got nan"),
