@@ -23,6 +23,8 @@ class JointReplayBuffer(ReplayBuffer):
     :param device: where samples go
     :param n_envs: number of slots, B * N
     :param n_agents: number of agents N
+    :param n_steps: steps whose rewards are summed, fewer where the episode or the newest step comes first
+    :param gamma: discount factor of that sum
     :param kwargs: passed on to SB3's ``ReplayBuffer``
     """
 
@@ -35,12 +37,22 @@ class JointReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         *,
         n_agents: int = 1,
+        n_steps: int = 1,
+        gamma: float = 0.99,
         **kwargs: Any,
     ) -> None:
         if n_envs % n_agents:
             raise ValueError(f"{n_envs} slots are no whole number of worlds with {n_agents} agents")
+        if n_steps < 1:
+            raise ValueError(f"n_steps must be at least 1, but got {n_steps}")
         super().__init__(buffer_size, observation_space, action_space, device, n_envs, **kwargs)
+        if n_steps > 1 and self.optimize_memory_usage:
+            raise ValueError(
+                "optimize_memory_usage keeps no observation behind the end of an episode: n_steps must be 1"
+            )
         self.n_agents = n_agents
+        self.n_steps = n_steps
+        self.gamma = gamma
         self.n_worlds = n_envs // n_agents
 
     def add(
@@ -81,29 +93,53 @@ class JointReplayBuffer(ReplayBuffer):
             self.pos = 0
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Joint transitions of randomly drawn worlds.
+        """Joint transitions of randomly drawn worlds, over ``n_steps`` steps.
 
         :param batch_inds: steps, shape (B,)
         :param env: to normalise observations and rewards with
         :return: observations (B, N, *O), actions (B, N, U), next observations (B, N, *O), dones without time
-            limits (B, N), rewards (B, N)
+            limits (B, N), rewards (B, N), and with ``n_steps`` above 1 what the value of the next observations is
+            discounted by, (B, 1)
         """
         worlds = np.random.randint(self.n_worlds, size=len(batch_inds))  # noqa: NPY002 - SB3 draws from the same one
-        joint = batch_inds * self.n_worlds + worlds
+        first = last = batch_inds * self.n_worlds + worlds
+        if self.n_steps == 1:
+            rewards, discounts = self._normalize_reward(self._joint(self.rewards, first), env), None
+        else:
+            last, rewards, discounts = self._look_ahead(batch_inds, worlds, env)
         if self.optimize_memory_usage:
             next_joint = (batch_inds + 1) % self.buffer_size * self.n_worlds + worlds
             next_obs = self._joint(self.observations, next_joint)
         else:
-            next_obs = self._joint(self.next_observations, joint)
+            next_obs = self._joint(self.next_observations, last)
         data = (
-            self._normalize_obs(self._joint(self.observations, joint), env),
-            self._joint(self.actions, joint),
+            self._normalize_obs(self._joint(self.observations, first), env),
+            self._joint(self.actions, first),
             self._normalize_obs(next_obs, env),
-            self._joint(self.dones, joint) * (1 - self._joint(self.timeouts, joint)),
-            self._normalize_reward(self._joint(self.rewards, joint), env),
+            self._joint(self.dones, last) * (1 - self._joint(self.timeouts, last)),
+            rewards,
+            *([] if discounts is None else [discounts]),
         )
-        return ReplayBufferSamples(*(self.to_torch(array, copy=False) for array in data))  # type: ignore[arg-type]  # arrays: no dicts here
+        return ReplayBufferSamples(*(self.to_torch(array, copy=False) for array in data))
+
+    def _look_ahead(
+        self, batch_inds: np.ndarray, worlds: np.ndarray, env: VecNormalize | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sum the rewards of ``n_steps`` steps, up to the end of the episode or the newest step.
+
+        :return: index of the last step's joint transition (B,), discounted sums (B, N), gamma ** steps (B, 1)
+        """
+        ahead = np.arange(self.n_steps)
+        steps = (batch_inds[:, None] + ahead) % self.buffer_size
+        joint = steps * self.n_worlds + worlds[:, None]
+        ends = self._joint(self.dones, joint).any(axis=2) | (steps == (self.pos - 1) % self.buffer_size)
+        ends[:, -1] = True
+        last = ends.argmax(axis=1)
+        weights = np.where(ahead <= last[:, None], self.gamma ** ahead.astype(np.float32), 0)
+        rewards = self._normalize_reward(self._joint(self.rewards, joint), env) * weights[..., None]
+        discounts = self.gamma ** (last + 1).astype(np.float32)[:, None]
+        return joint[np.arange(len(joint)), last], rewards.sum(axis=1), discounts
 
     def _joint(self, slots: np.ndarray, indices: np.ndarray) -> np.ndarray:
-        """Rows of ``slots`` (pos, B * N, ...) regrouped by worlds: a copy of shape (len(indices), N, ...)."""
+        """Rows of ``slots`` (pos, B * N, ...) regrouped by worlds: a copy of shape (*indices.shape, N, ...)."""
         return slots.reshape(-1, self.n_agents, *slots.shape[2:]).take(indices, axis=0)

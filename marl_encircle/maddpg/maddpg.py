@@ -68,6 +68,7 @@ class MADDPG(OffPolicyAlgorithm):
     :param policy_delay: critic updates per update of the actors and the targets
     :param max_grad_norm: largest norm of the gradient of the actors and of the critics, None: no limit
     :param actor_regularization: weight of the actors' mean squared output before tanh (openai/maddpg: 1e-3)
+    :param n_steps: rewards in a target before the critics estimate the rest; 1 is Eq. 3
     :param policy_kwargs: passed on to the policy, see ``MADDPGPolicy``
     :param seed: seed of the pseudo random generators
     :param kwargs: passed on to SB3's ``OffPolicyAlgorithm``
@@ -104,6 +105,7 @@ class MADDPG(OffPolicyAlgorithm):
         policy_delay: int = 1,
         max_grad_norm: float | None = None,
         actor_regularization: float = 1e-3,
+        n_steps: int = 1,
         policy_kwargs: dict[str, Any] | None = None,
         seed: int | None = None,
         _init_setup_model: bool = True,
@@ -129,6 +131,7 @@ class MADDPG(OffPolicyAlgorithm):
             **kwargs,
         )
         self.n_agents = n_agents
+        self.n_steps = n_steps  # not to SB3, whose own buffer would be asked for
         self.critic_kind = critic
         if exploration_noise is None:
             exploration_noise = 0.3 if action_noise is None else 0.0
@@ -151,8 +154,6 @@ class MADDPG(OffPolicyAlgorithm):
         self._convert_train_freq()
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
-        if self.n_steps != 1:
-            raise ValueError(f"MADDPG has one-step returns only, but got n_steps={self.n_steps}")
         self.n_agents = count_agents(self.env, self.n_agents)
         # The exploration's own generator goes on where a loaded model stopped
         super().set_random_seed(self.seed)
@@ -171,7 +172,7 @@ class MADDPG(OffPolicyAlgorithm):
                 n_envs=self.n_envs,
                 n_agents=self.n_agents,
                 optimize_memory_usage=self.optimize_memory_usage,
-                **self.replay_buffer_kwargs,
+                **({"n_steps": self.n_steps, "gamma": self.gamma} | self.replay_buffer_kwargs),
             )
         self.policy = self.policy_class(  # type: ignore[assignment]  # SB3 types any BasePolicy
             self.observation_space,
@@ -228,9 +229,10 @@ class MADDPG(OffPolicyAlgorithm):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
             # The targets y_i = r_i + gamma Q'_i(s', mu'_1(o'_1) .. mu'_n(o'_n)) of Eq. 3; termination cuts the future
+            discounts = self.gamma if batch.discounts is None else batch.discounts.T
             with th.no_grad():
                 next_q_values = self.critic_target(batch.next_observations, self._target_actions(batch)).amin(dim=0)
-                target_q_values = batch.rewards.T + (1 - batch.dones.T) * self.gamma * next_q_values
+                target_q_values = batch.rewards.T + (1 - batch.dones.T) * discounts * next_q_values
 
             # Critics: minimise the mean of (y_i - Q_i(s, a_1 .. a_n))^2, Eq. 3
             obs, actions = batch.observations, batch.actions

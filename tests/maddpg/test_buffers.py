@@ -102,6 +102,32 @@ def test_samples_are_normalised_by_vec_normalize() -> None:
     np.testing.assert_allclose(normalised.rewards, plain.rewards / 100, rtol=1e-6)
 
 
+def test_rewards_of_several_steps_are_summed_up_to_the_end_of_the_episode() -> None:
+    buffer = make_buffer(n_steps=3, gamma=0.5)
+    # Steps 0 to 4 are an episode; worlds 0 and 1 end it by the time limit, worlds 2 and 3 terminate. 7 is the newest
+    fill(buffer, 8, done_at=4, infos=[{"TimeLimit.truncated": slot < 6} for slot in range(12)])
+    sample = buffer.sample(2000)
+    world, _, first = sample.observations[:, 0].unbind(-1)
+    last = {0: 2, 1: 3, 2: 4, 3: 4, 4: 4, 5: 7, 6: 7, 7: 7}
+    assert sample.next_observations[:, 0, 2].tolist() == [last[step] + 1 for step in first.int().tolist()]
+    assert set(first.tolist()) == set(last)
+    for i in range(200):
+        steps = np.arange(int(first[i]), last[int(first[i])] + 1)
+        rewards = 100 * np.arange(3)[:, None] + steps
+        np.testing.assert_allclose(sample.rewards[i], (rewards * 0.5 ** np.arange(len(steps))).sum(axis=1))
+        assert sample.discounts[i] == 0.5 ** len(steps)
+        assert (sample.dones[i] == float(steps[-1] == 4 and world[i] >= 2)).all()
+
+
+def test_a_sum_does_not_run_from_the_newest_step_into_the_oldest() -> None:
+    buffer = make_buffer(buffer_size=120, n_steps=4)  # 10 steps of 4 worlds
+    fill(buffer, 13)
+    sample = buffer.sample(1000)
+    steps = sample.next_observations[:, 0, 2] - sample.observations[:, 0, 2]
+    assert set(steps.tolist()) == {1, 2, 3, 4}
+    assert sample.next_observations[..., 2].max() == 13
+
+
 def test_slots_must_be_whole_worlds() -> None:
     with pytest.raises(ValueError, match="10 slots are no whole number of worlds with 3 agents"):
         JointReplayBuffer(100, OBSERVATION, ACTION, n_envs=10, n_agents=3)

@@ -111,13 +111,15 @@ def copy_from_sb3(model: MADDPG, sb3: TD3) -> None:
     model.critic_target.load_state_dict(model.critic.state_dict())
 
 
+@pytest.mark.parametrize("n_steps", [1, 3])
 @pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize(("cls", "sb3_cls"), [(MADDPG, DDPG), (MATD3, TD3)])
-def test_with_one_agent_200_updates_equal_sb3(cls: type[MADDPG], sb3_cls: type[TD3], critic: str) -> None:
+def test_with_one_agent_200_updates_equal_sb3(cls: type[MADDPG], sb3_cls: type[TD3], critic: str, n_steps: int) -> None:
     def make_env() -> DummyVecEnv:
         return DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 4)
 
     common = {"gamma": 0.95, "tau": 0.01, "learning_rate": 1e-3, "buffer_size": 2000, "seed": 0, "device": "cpu"}
+    common["n_steps"] = n_steps
     net_arch = {"pi": [16, 12], "qf": [12, 16]}
     sb3 = sb3_cls(
         "MlpPolicy",
@@ -141,8 +143,9 @@ def test_with_one_agent_200_updates_equal_sb3(cls: type[MADDPG], sb3_cls: type[T
     rng = np.random.default_rng(0)
     for _ in range(100):
         obs, next_obs = rng.standard_normal((2, 4, 3))
-        infos = [{"TimeLimit.truncated": bool(truncated)} for truncated in rng.random(4) < 0.5]
-        transition = obs, next_obs, rng.uniform(-1, 1, (4, 1)), rng.standard_normal(4), rng.random(4) < 0.3, infos
+        dones = rng.random(4) < 0.3
+        infos = [{"TimeLimit.truncated": bool(truncated)} for truncated in dones & (rng.random(4) < 0.5)]
+        transition = obs, next_obs, rng.uniform(-1, 1, (4, 1)), rng.standard_normal(4), dones, infos
         sb3.replay_buffer.add(*transition)
         model.replay_buffer.add(*transition)
     for learner in (sb3, model):
@@ -463,7 +466,15 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"n_steps": 3}, "n_steps=3"),
+        ({"n_steps": 0}, "n_steps must be at least 1, but got 0"),
+        (
+            {
+                "n_steps": 3,
+                "optimize_memory_usage": True,
+                "replay_buffer_kwargs": {"handle_timeout_termination": False},
+            },
+            "n_steps must be 1",
+        ),
         ({"replay_buffer_class": DDPG}, "JointReplayBuffer"),
         ({"critic": "central"}, "central"),
         ({"policy_delay": 0}, "policy_delay must be at least 1, but got 0"),
