@@ -111,6 +111,10 @@ class MADDPG(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
+        if hasattr(env, "possible_agents") and not isinstance(env, VecEnv):
+            raise ValueError("a PettingZoo environment learns as a VecEnv: SuperSuitVecEnv(lambda: env, n_worlds=...)")
+        if kwargs.pop("use_sde", False):
+            raise ValueError("use_sde is not for deterministic actors: see exploration_noise and action_noise")
         super().__init__(
             policy,
             env,
@@ -131,6 +135,7 @@ class MADDPG(OffPolicyAlgorithm):
             **kwargs,
         )
         self.n_agents = n_agents
+        self.agents: tuple[str, ...] | None = None
         self.n_steps = n_steps  # not to SB3, whose own buffer would be asked for
         self.critic_kind = critic
         if exploration_noise is None:
@@ -155,6 +160,7 @@ class MADDPG(OffPolicyAlgorithm):
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
         self.n_agents = count_agents(self.env, self.n_agents)
+        self.agents = names_of_agents(self.env) or self.agents
         # The exploration's own generator goes on where a loaded model stopped
         super().set_random_seed(self.seed)
 
@@ -183,6 +189,7 @@ class MADDPG(OffPolicyAlgorithm):
             **{"n_critics": self.n_critics, **self.policy_kwargs},
         )
         self.policy = self.policy.to(self.device)
+        self.policy.agents = self.agents
         self._create_aliases()
 
     def _create_aliases(self) -> None:
@@ -517,3 +524,9 @@ def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
     if isinstance(env, VecEnv) and (n < 1 or env.num_envs % n):
         raise ValueError(f"{env.num_envs} slots are no whole number of worlds with n_agents={n}")
     return n
+
+
+def names_of_agents(env: GymEnv | None) -> tuple[str, ...] | None:
+    """Return the agents' names in the order of the slots, None where the environment has no attribute ``agents``."""
+    agents = getattr(env, "agents", None) if isinstance(env, VecEnv) else None
+    return tuple(agents) if agents else None

@@ -68,6 +68,7 @@ def test_the_defaults_are_those_of_the_documentation() -> None:
         "exploration_random": 0.05,
         "policy_delay": 1,
         "actor_regularization": 1e-3,
+        "n_steps": 1,
     }
     assert defaults(MATD3) == {"policy_delay": 2, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
     assert make_model().exploration_noise == 0.3
@@ -428,7 +429,7 @@ def test_slots_that_hide_their_agents_are_refused_unless_the_number_is_given() -
         make_model(env=HidesAgents(LabelledWorlds()), n_agents=0)
 
 
-def test_the_bare_supersuit_wrapper_is_refused() -> None:
+def test_a_pettingzoo_environment_and_the_bare_supersuit_wrapper_are_refused() -> None:
     class Parallel(ParallelEnv):
         metadata: ClassVar[dict[str, Any]] = {"name": "parallel"}
         possible_agents: ClassVar[list[str]] = ["agent_0", "agent_1"]
@@ -441,6 +442,8 @@ def test_the_bare_supersuit_wrapper_is_refused() -> None:
         def action_space(self, agent: str) -> spaces.Box:
             return spaces.Box(-1, 1, (2,), np.float32)
 
+    with pytest.raises(ValueError, match="SuperSuitVecEnv"):
+        make_model(env=Parallel())
     slots = supersuit.pettingzoo_env_to_vec_env_v1(Parallel())
     env = supersuit.concat_vec_envs_v1(slots, 3, base_class="stable_baselines3")
     assert env.num_envs == 6
@@ -476,6 +479,7 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
             "n_steps must be 1",
         ),
         ({"replay_buffer_class": DDPG}, "JointReplayBuffer"),
+        ({"use_sde": True}, "use_sde is not for deterministic actors"),
         ({"critic": "central"}, "central"),
         ({"policy_delay": 0}, "policy_delay must be at least 1, but got 0"),
         ({"max_grad_norm": 0.0}, r"max_grad_norm must be positive or None, but got 0\.0"),
@@ -512,6 +516,22 @@ def test_predict_takes_slots_one_world_or_a_dict_by_agent() -> None:
     # Each agent has its own actor
     same = model.predict(np.ones((3, 3), np.float32))[0]
     assert len(np.unique(same, axis=0)) == 3
+
+
+def test_a_dict_is_read_by_name_where_the_environment_names_its_agents(tmp_path: Path) -> None:
+    class Named(LabelledWorlds):
+        agents = ("left", "middle", "right")
+
+    obs = dict(zip(Named.agents, np.random.default_rng(0).standard_normal((3, 3)).astype(np.float32), strict=True))
+    for env in Named(), VecMonitor(Named()):
+        model = make_model(env=env)
+        model.save(tmp_path / "model.zip")
+        for same in model, load(MADDPG, tmp_path / "model.zip"):
+            expected, _ = same.predict(obs)
+            actions, _ = same.predict({name: obs[name] for name in reversed(Named.agents)})
+            assert all((actions[name] == expected[name]).all() for name in Named.agents)
+            with pytest.raises(ValueError, match="observations of left, middle, right"):
+                same.predict({f"agent_{i}": np.zeros(3) for i in range(3)})
 
 
 @pytest.mark.parametrize(
