@@ -43,7 +43,7 @@ def main() -> int:
     """Print what is wrong and return the exit code."""
     try:
         lock, constraints, installed = read_pins(LOCK), read_pins(CONSTRAINTS), installed_versions()
-    except (CheckError, OSError) as error:
+    except (CheckError, OSError, UnicodeDecodeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     faults = [*faults_of_lock(lock, constraints), *faults_of_environment(lock, installed)]
@@ -83,9 +83,15 @@ def read_pins(path: Path) -> dict[str, Pin]:
 def installed_versions() -> dict[str, str]:
     """Return the version of each installed distribution.
 
-    :raises CheckError: if the package itself is not among them
+    :raises CheckError: if the package itself is not among them, one has no name, or one is there in two versions
     """
-    versions = {canonicalize_name(d.metadata["Name"]): d.version.partition("+")[0] for d in metadata.distributions()}
+    versions: dict[str, str] = {}
+    for distribution in metadata.distributions():
+        if not distribution.metadata["Name"]:
+            raise CheckError(f"a distribution without a name lies in {distribution.locate_file('')}")
+        name, version = canonicalize_name(distribution.metadata["Name"]), distribution.version.partition("+")[0]
+        if versions.setdefault(name, version) != version:  # which of the two is imported, the search path decides
+            raise CheckError(f"{name} is there twice: {versions[name]} and {version}")
     if not versions.keys() >= OURS:
         raise CheckError("this environment does not hold the package: make setup")
     return {name: version for name, version in versions.items() if name not in OURS}

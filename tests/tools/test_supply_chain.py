@@ -94,3 +94,29 @@ def test_the_command_ends_with_1_for_a_fault_and_2_where_it_could_not_look(
     monkeypatch.setattr(supply_chain, "OURS", {"marl-encircle", "no-such-distribution"})
     assert supply_chain.main() == 2
     assert "this environment does not hold the package" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("Metadata-Version: 2.1\nName: numpy\nVersion: 9.9\n", "numpy is there twice: 9.9 and "),
+        ("Metadata-Version: 2.1\nVersion: 9.9\n", "a distribution without a name lies in "),
+    ],
+)
+def test_a_distribution_that_hides_another_is_not_overlooked(
+    supply_chain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, reason: str
+) -> None:
+    (tmp_path / "numpy-9.9.dist-info").mkdir()
+    (tmp_path / "numpy-9.9.dist-info" / "METADATA").write_text(content)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(supply_chain.CheckError, match=reason):
+        supply_chain.installed_versions()
+
+
+def test_a_lock_that_is_no_text_ends_with_2(
+    supply_chain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "requirements.lock").write_bytes(b"\xff\xfe")
+    monkeypatch.setattr(supply_chain, "LOCK", tmp_path / "requirements.lock")
+    assert supply_chain.main() == 2
+    assert "error: " in capsys.readouterr().err
