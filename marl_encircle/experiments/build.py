@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import safetensors.torch
 from gymnasium import spaces
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from marl_encircle import files
@@ -124,12 +125,13 @@ def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG
     :param kwargs: passed on to the algorithm
     """
     a, n = config.algorithm, config.scenario.pursuers
+    end = a.learning_rate_end
     # A buffer larger than the training would only cost memory.
     buffer_world_steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
     return ALGORITHMS[a.name](
         "MlpPolicy",
         env,
-        learning_rate=a.learning_rate,
+        learning_rate=a.learning_rate if end is None else LinearSchedule(a.learning_rate, end, 1.0),
         buffer_size=buffer_world_steps * n,
         learning_starts=a.random_world_steps * n,
         batch_size=a.batch_size,
@@ -142,6 +144,7 @@ def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG
         exploration_random=a.exploration_random,
         policy_delay=a.policy_delay,
         max_grad_norm=a.max_grad_norm,
+        n_steps=a.n_steps,
         actor_regularization=a.actor_regularization,
         policy_kwargs={"net_arch": list(a.net_arch)},
         seed=seed,

@@ -17,9 +17,11 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_serializer,
 )
 
 from marl_encircle.core.geometry import Closure
@@ -96,7 +98,10 @@ class Schedule(Section):
 
 
 class AlgorithmConfig(Section):
-    """One of ``ALGORITHMS``. ``*_world_steps`` count steps of all pursuers of one world, ``train_freq`` vec steps."""
+    """One of ``ALGORITHMS``. ``*_world_steps`` count steps of all pursuers of one world, ``train_freq`` vec steps.
+
+    A key with a default came after the first runs; one that has it is left out, so that their hashes stay.
+    """
 
     name: str
     critic: Literal["per_agent", "shared"]
@@ -114,6 +119,13 @@ class AlgorithmConfig(Section):
     gradient_steps: Count
     exploration_noise: Schedule
     exploration_random: Share
+    learning_rate_end: Annotated[float, Field(gt=0, le=1)] | None = None
+    n_steps: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        defaults = {name: field.default for name, field in type(self).model_fields.items() if not field.is_required()}
+        return {key: value for key, value in handler(self).items() if key not in defaults or value != defaults[key]}
 
 
 class Ramp(Section):

@@ -36,10 +36,14 @@ class SettingConfig(Section):
 
 
 class Group(Section):
-    """Every method in every setting with every seed."""
+    """Every method in every setting with every seed.
+
+    :param overrides: changes of their configurations, ``section.key=value`` each
+    """
 
     methods: Annotated[list[str], Field(min_length=1)]
     algorithm: str = "maddpg"
+    overrides: Annotated[list[str], Field(default_factory=list)]
     settings: Annotated[list[SettingConfig], Field(min_length=1)]
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=1 << 32)]], Field(min_length=1)]
 
@@ -147,7 +151,8 @@ def load_grid(name: str) -> Grid:
     for group in grid.groups:
         for method in map(beside, group.methods):
             for setting in (Setting(**column.model_dump()) for column in group.settings):
-                first = Job(method, setting, 0, grid.profile, beside(grid.scenario), beside(group.algorithm))
+                names = beside(grid.scenario), beside(group.algorithm)
+                first = Job(method, setting, 0, grid.profile, *names, tuple(group.overrides))
                 with naming_file(path):
                     config = first.config
                     for seed in group.seeds:

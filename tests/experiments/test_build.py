@@ -175,6 +175,19 @@ def test_the_noise_follows_the_world_steps() -> None:
     assert noise(1 - 500 / 2000) == noise(0.0) == noise(-0.1) == 0.1
 
 
+def test_the_learning_rate_falls_over_the_whole_training() -> None:
+    for end, halfway in ("null", 2e-3), ("1e-3", 1.5e-3):
+        config = tiny(overrides=["algorithm.learning_rate=2e-3", f"algorithm.learning_rate_end={end}"])
+        assert build_model(config, build_vec_env(config, 2), 0).lr_schedule(0.5) == pytest.approx(halfway)
+
+
+def test_the_rewards_of_several_steps_are_summed_where_a_configuration_says_so() -> None:
+    config = tiny(overrides=["algorithm.n_steps=3", "algorithm.gamma=0.8"])
+    model = build_model(config, build_vec_env(config, 2), 0)
+    assert model.replay_buffer is not None
+    assert (model.n_steps, model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 3, 0.8)
+
+
 def test_the_registry_has_what_a_configuration_may_name() -> None:
     assert ALGORITHMS == {"maddpg": MADDPG, "matd3": MATD3}
     for name, algorithm in ALGORITHMS.items():

@@ -73,6 +73,16 @@ def test_a_file_whose_name_cannot_name_a_method_is_told_to_add_one(tmp_path: Pat
     assert load_config(write(tmp_path, "my idea.yaml", "base: ours\nname: idea\n")).reward.name == "idea"
 
 
+def test_keys_that_came_later_leave_the_runs_before_them_their_hash() -> None:
+    usual = load_config(overrides=["algorithm.n_steps=1", "algorithm.learning_rate_end=null"])
+    assert usual.to_dict() == load_config().to_dict()
+    assert not {"n_steps", "learning_rate_end"} & usual.to_dict()["algorithm"].keys()
+    changed = load_config(overrides=["algorithm.n_steps=3", "algorithm.learning_rate_end=1e-4"])
+    assert changed.to_dict()["algorithm"] == usual.to_dict()["algorithm"] | {"n_steps": 3, "learning_rate_end": 1e-4}
+    assert Config.from_dict(changed.to_dict()) == changed
+    assert Config.from_dict(usual.to_dict()) == usual
+
+
 def test_an_algorithm_is_known_once_the_registry_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(maddpg.ALGORITHMS, "mine", maddpg.MATD3)
     assert load_config(overrides=["algorithm.name=mine"]).to_dict()["algorithm"]["name"] == "mine"

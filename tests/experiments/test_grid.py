@@ -111,6 +111,13 @@ def test_a_users_method_is_given_by_path_from_the_grids_folder(tmp_path: Path, m
         assert grid.jobs[1].config.cell == Cell("idea", ONE)
 
 
+def test_a_group_may_change_the_configurations_of_its_runs(tmp_path: Path) -> None:
+    text = GRID.format(method="model_b").replace("seeds:", "overrides: [algorithm.gamma=0.5]\n    seeds:")
+    jobs = grid_of(tmp_path, text).jobs
+    assert {job.config.algorithm.gamma for job in jobs} == {0.5}
+    assert all(arguments(job)[-2:] == ["--set", "algorithm.gamma=0.5"] for job in jobs)
+
+
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
     for scale in (0.1, 0.2):
         (tmp_path / "idea.yaml").write_text(f"base: ours\nscale: {scale}\n")
