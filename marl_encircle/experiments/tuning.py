@@ -48,6 +48,7 @@ def tune(
     :param n_workers: trainings at a time
     :param report: called whenever a trial starts, goes on after a stop, or ends
     :raises ConfigError: without Optuna; or if so many trainings at a time do not fit into this machine's memory
+    :raises DamagedFileError: if what is there is no record of a search
     :raises OtherRunError: if ``out`` holds another search, with the difference
     :raises FolderLockedError: if another search works in ``out``
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
@@ -61,6 +62,8 @@ def tune(
     check_trainings([space.largest] * n_workers, n_workers)
     path = Path(out) / STUDY
     with locks.folder_lock(out):
+        if path.is_symlink():  # SQLite would write where it leads to
+            raise files.DamagedFileError(path, "a link, not the record of a search")
         try:
             storage = optuna.storages.RDBStorage(f"sqlite:///{path}")
         except sql.exc.DatabaseError as error:

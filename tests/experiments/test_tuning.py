@@ -322,6 +322,14 @@ def test_a_search_without_optuna_names_the_extra_and_writes_nothing(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_record_that_leads_elsewhere_is_not_written_to(space: Space, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "study.db").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(files.DamagedFileError, match=r"study\.db: a link"):
+        tune(space, tmp_path / "out", 1, 1)
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_a_damaged_record_is_named_and_kept(space: Space, tmp_path: Path) -> None:
     path = tmp_path / "out" / "study.db"
     files.write_text(path, "no database, whatever its name says; " * 50)
