@@ -68,12 +68,15 @@ class EventFiles(TensorBoardOutputFormat):
     :param seed: training seed
     :param steps: of all agents until now
     :param draw: how to draw rounds; None for no pictures
+    :raises DamagedFileError: if the folder is a link
     """
 
     def __init__(self, folder: Path, config: Config, seed: int, steps: int, draw: Draw | None = None) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         self.config, self.draw, self.folder = config, draw, folder
+        if folder.is_symlink():
+            raise files.DamagedFileError(folder, "a link, where files would be removed and written elsewhere")
         earlier = list(folder.glob("events.out.tfevents.*"))
         if steps == 0:  # the training starts over
             for path in earlier:

@@ -12,7 +12,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import metadata
-from tiny_runs import contents, copy_of_finished, finished, tiny
+from tiny_runs import contents, copy_of_finished, everything_in, finished, tiny
 
 from marl_encircle import files
 from marl_encircle.core.rewards import TERMS
@@ -22,7 +22,7 @@ from marl_encircle.experiments.build import load_policy
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.descriptions import METRICS, TRAINING, hyperparameters, texts
-from marl_encircle.experiments.tensorboard import Picture, gather, is_drawn
+from marl_encircle.experiments.tensorboard import EventFiles, Picture, gather, is_drawn
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.thumbnails import thumbnails
 
@@ -251,3 +251,12 @@ def one_dot(_policy: MADDPGPolicy, _config: Config) -> list[Picture]:
     out = io.BytesIO()
     Image.new("RGB", (1, 1)).save(out, "PNG")
     return [Picture("dot", out.getvalue(), 1, 1)]
+
+
+def test_event_files_that_lie_elsewhere_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "events.out.tfevents.1").write_bytes(b"somebody's")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(files.DamagedFileError, match="link: a link, where files"):
+        EventFiles(tmp_path / "link", tiny(), 0, 0)
+    assert everything_in(tmp_path / "elsewhere") == ["events.out.tfevents.1"]
