@@ -60,7 +60,7 @@ class Export(NamedTuple):
     path: Path
     random: float
     played: float
-    description: dict[str, str]
+    description: dict[str, Any]
 
 
 class Actors(nn.Module):
@@ -111,15 +111,15 @@ def export_run(run: str | Path, to: Format, out: str | Path | None = None) -> Ex
     return Export(Path(out), random, played, description)
 
 
-def describe(policy: MADDPGPolicy, config: Config, record: dict[str, Any]) -> dict[str, str]:
-    """Return what somebody who has only the file needs to know, each value a string or JSON."""
+def describe(policy: MADDPGPolicy, config: Config, record: dict[str, Any]) -> dict[str, Any]:
+    """Return what somebody who has only the file needs to know, as plain data."""
     parts = {name: [part.start, part.stop] for name, part in layout(config.scenario).items()}
     return {
         "method": config.reward.name,
-        "setting": json.dumps(config.cell.setting._asdict()),
-        "agents": json.dumps(policy.agents),
-        "observation_layout": json.dumps(parts),
-        "train_seed": str(record["seed"]),
+        "setting": config.cell.setting._asdict(),
+        "agents": list(policy.agents or ()),
+        "observation_layout": parts,
+        "train_seed": record["seed"],
         "status": record["status"],
         "config_hash": record["config_hash"],
         "policy_sha256": record["sha256"]["policy.safetensors"],
@@ -162,7 +162,7 @@ def difference(policy: MADDPGPolicy, act: Act, observations: Array) -> float:
     return float(np.abs(actions - predict(policy, observations)).max())
 
 
-def _to_onnx(actors: Actors, observations: th.Tensor, description: dict[str, str]) -> bytes:
+def _to_onnx(actors: Actors, observations: th.Tensor, description: dict[str, Any]) -> bytes:
     try:
         import onnx
         import onnx_ir
@@ -184,10 +184,15 @@ def _to_onnx(actors: Actors, observations: th.Tensor, description: dict[str, str
     assert program is not None
     ClearMetadataAndDocStringPass()(program.model)  # with stack traces, and so the paths of this machine
     model = onnx_ir.to_proto(program.model)
-    onnx.helper.set_model_props(model, description)
+    onnx.helper.set_model_props(model, {key: _as_text(value) for key, value in description.items()})
     onnx.checker.check_model(model)
     data: bytes = model.SerializeToString(deterministic=True)
     return data
+
+
+def _as_text(value: Any) -> str:
+    """Return a value of ONNX's metadata: a string as it is, else JSON."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _from_onnx(data: bytes) -> Act:
@@ -197,7 +202,7 @@ def _from_onnx(data: bytes) -> Act:
     return lambda observations: session.run(["actions"], {"observations": observations})[0]
 
 
-def _to_torchscript(actors: Actors, observations: th.Tensor, description: dict[str, str]) -> bytes:
+def _to_torchscript(actors: Actors, observations: th.Tensor, description: dict[str, Any]) -> bytes:
     out = io.BytesIO()
     with _quiet(), th.no_grad():  # torch deprecates TorchScript in favour of torch.export, and reads it still
         module = th.jit.trace(actors, observations)  # type: ignore[no-untyped-call]  # torch does not type it
@@ -211,7 +216,7 @@ def _from_torchscript(data: bytes) -> Act:
     return _act(module)
 
 
-def _to_torch_export(actors: Actors, observations: th.Tensor, description: dict[str, str]) -> bytes:
+def _to_torch_export(actors: Actors, observations: th.Tensor, description: dict[str, Any]) -> bytes:
     out = io.BytesIO()
     with _quiet(), th.no_grad():
         program = th.export.export(actors, (observations,), dynamic_shapes=({0: th.export.Dim("worlds")},))
@@ -250,7 +255,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-_WRITERS: dict[Format, Callable[[Actors, th.Tensor, dict[str, str]], bytes]] = {
+_WRITERS: dict[Format, Callable[[Actors, th.Tensor, dict[str, Any]], bytes]] = {
     "onnx": _to_onnx,
     "torchscript": _to_torchscript,
     "torch-export": _to_torch_export,

@@ -61,7 +61,9 @@ def test_the_file_acts_as_predict_in_any_number_of_worlds(exported: dict[Format,
 def test_the_file_says_whose_the_actors_are(exported: dict[Format, export.Export], to: Format) -> None:
     path = exported[to].path
     if to == "onnx":
-        found = {entry.key: entry.value for entry in importlib.import_module("onnx").load(path).metadata_props}
+        texts = {entry.key: entry.value for entry in importlib.import_module("onnx").load(path).metadata_props}
+        as_json = ("setting", "agents", "observation_layout", "train_seed")
+        found = texts | {key: json.loads(texts[key]) for key in as_json}
     else:
         inside = {"metadata.json": ""}
         if to == "torchscript":
@@ -72,10 +74,10 @@ def test_the_file_says_whose_the_actors_are(exported: dict[Format, export.Export
         found = json.loads(inside["metadata.json"])
     record = read_record(finished())
     assert found == exported[to].description
-    assert json.loads(found["setting"]) == {"speed_ratio": 1.1, "pursuers": 3, "obstacles": 1, "scene": "random"}
-    assert json.loads(found["agents"]) == ["pursuer_0", "pursuer_1", "pursuer_2"]
-    assert json.loads(found["observation_layout"])["target"] == [4, 6]
-    assert (found["method"], found["train_seed"], found["status"]) == ("ours", "0", "finished")
+    assert found["setting"] == {"speed_ratio": 1.1, "pursuers": 3, "obstacles": 1, "scene": "random"}
+    assert found["agents"] == ["pursuer_0", "pursuer_1", "pursuer_2"]
+    assert found["observation_layout"]["target"] == [4, 6]
+    assert (found["method"], found["train_seed"], found["status"]) == ("ours", 0, "finished")
     assert found["config_hash"] == record["config_hash"]
     assert found["policy_sha256"] == record["sha256"]["policy.safetensors"]
 
