@@ -26,6 +26,7 @@ from marl_encircle.experiments.config import (
     Schedule,
     load_config,
 )
+from marl_encircle.experiments.features import RelativeFeatures
 from marl_encircle.experiments.pretrained import find_run, is_run_path, pretrained_runs, setting_of
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.trainable import check_curriculum
@@ -146,11 +147,21 @@ def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG
         max_grad_norm=a.max_grad_norm,
         n_steps=a.n_steps,
         actor_regularization=a.actor_regularization,
-        policy_kwargs={"net_arch": list(a.net_arch)},
+        policy_kwargs={"net_arch": list(a.net_arch), **features_kwargs(config)},
         seed=seed,
         device="cpu",
         **kwargs,
     )
+
+
+def features_kwargs(config: Config) -> dict[str, Any]:
+    """Return the policy's arguments that say what its networks read."""
+    if config.algorithm.features == "observation":
+        return {}
+    return {
+        "features_extractor_class": RelativeFeatures,
+        "features_extractor_kwargs": {"scenario": config.scenario},
+    }
 
 
 class NoiseSchedule:
@@ -180,6 +191,7 @@ def build_policy(config: Config) -> MADDPGPolicy:
         n_agents=config.scenario.pursuers,
         critic="shared",
         net_arch={"pi": list(algorithm.net_arch), "qf": []},
+        **features_kwargs(config),
     )
     policy.agents = config.scenario.agents
     return policy

@@ -36,6 +36,7 @@ from marl_encircle.experiments.yaml_files import ConfigError, merge
 from marl_encircle.spelling import nearest
 
 Profile = Literal["full", "smoke"]
+Features = Literal["observation", "relative"]
 Count = Annotated[int, Field(ge=1, le=10**10)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Episodes = Annotated[int, Field(ge=1, le=10**6)]
@@ -121,6 +122,7 @@ class AlgorithmConfig(Section):
     exploration_random: Share
     learning_rate_end: Annotated[float, Field(gt=0, le=1)] | None = None
     n_steps: Annotated[int, Field(ge=1, le=1000)] = 1
+    features: Features = "observation"
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -362,7 +364,7 @@ def _check_networks(config: Config) -> None:
 
 def count_weights(config: Config) -> dict[str, int]:
     """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
-    a, n, size = config.algorithm, config.scenario.pursuers, observation_size(config)
+    a, n, size = config.algorithm, config.scenario.pursuers, features_size(config.scenario, config.algorithm.features)
     joint = n * (size + 2)
     shared = a.critic == "shared"
     return {
@@ -377,7 +379,14 @@ def _weights(sizes: list[int]) -> int:
 
 def observation_size(config: Config) -> int:
     """Return the number of values that a pursuer observes."""
-    return int(list(layout(config.scenario).values())[-1].stop)
+    return features_size(config.scenario, "observation")
+
+
+def features_size(scenario: Scenario, features: Features) -> int:
+    """Return the number of values that the networks read of a pursuer's observation."""
+    size = list(layout(scenario).values())[-1].stop
+    others = scenario.pursuers - 1 + scenario.units
+    return int(size + (4 * others if features == "relative" else 0))
 
 
 def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:

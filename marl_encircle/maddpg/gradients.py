@@ -75,10 +75,12 @@ def actor_gradients(
 def is_plain(model: Actor | CentralCritic) -> bool:
     """Whether the gradients by hand are those of autograd, with all that a user may have changed in the model.
 
-    That is: ReLU networks of one or more hidden layers, on the observations themselves, none shared by two estimates;
-    no subclass or parametrisation, no hook, no frozen parameter, no autocast.
+    That is: ReLU networks of one or more hidden layers, on features that have nothing to learn, none shared by two
+    estimates; no subclass or parametrisation, no hook, no frozen parameter, no autocast.
     """
-    modules = list(model.modules())
+    learns_features = any(True for _ in model.features_extractor.parameters())
+    features = set() if learns_features else set(model.features_extractor.modules())
+    modules = [module for module in model.modules() if module not in features]
     networks = [module for module in modules if type(module) is StackedMLP]
     return (
         all(type(module) in PLAIN for module in modules)

@@ -16,6 +16,13 @@ from marl_encircle.maddpg.policies import MADDPGPolicy
 N_AGENTS, BATCH_SIZE, OBSERVATION_SIZE, ACTION_SIZE = 3, 7, 5, 2
 
 
+class Squares(FlattenExtractor):
+    """Features that have nothing to learn."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations).square()
+
+
 class Rectifier(nn.ReLU):
     """ReLU under another name, for which nothing is done by hand."""
 
@@ -36,11 +43,15 @@ def policy(activation_fn: type[nn.Module], **kwargs: Any) -> MADDPGPolicy:
     return policy.double()
 
 
+@pytest.mark.parametrize("features", [FlattenExtractor, Squares])
 @pytest.mark.parametrize("share_parameters", [False, True])
 @pytest.mark.parametrize("n_critics", [1, 2])
 @pytest.mark.parametrize("critic", ["per_agent", "shared"])
-def test_by_hand_and_by_autograd_are_the_same(critic: str, n_critics: int, share_parameters: bool) -> None:
+def test_by_hand_and_by_autograd_are_the_same(
+    critic: str, n_critics: int, share_parameters: bool, features: type[FlattenExtractor]
+) -> None:
     how: dict[str, Any] = {"critic": critic, "n_critics": n_critics, "share_parameters": share_parameters}
+    how["features_extractor_class"] = features
     by_hand, by_autograd = policy(nn.ReLU, **how), policy(Rectifier, **how)
     assert is_plain(by_hand.actor)
     assert is_plain(by_hand.critic)
@@ -134,7 +145,7 @@ def test_what_a_user_changes_is_left_to_autograd(change: Callable[[Any, StackedM
 
 
 def test_other_networks_are_left_to_autograd() -> None:
-    assert not is_plain(policy(nn.ReLU, features_extractor_class=Scaled).critic)
+    assert not is_plain(policy(nn.ReLU, features_extractor_class=Learned).critic)
     th.manual_seed(0)
     twins = policy(nn.ReLU, n_critics=2).critic
     twins.q_networks[1] = twins.q_networks[0]
@@ -145,11 +156,15 @@ def test_other_networks_are_left_to_autograd() -> None:
         assert not is_plain(policy(nn.ReLU).actor)
 
 
-class Scaled(FlattenExtractor):
-    """Features that are not the observation itself."""
+class Learned(FlattenExtractor):
+    """Features that have something to learn."""
+
+    def __init__(self, observation_space: spaces.Space[Any]) -> None:
+        super().__init__(observation_space)
+        self.scale = nn.Parameter(th.ones(1))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return 2 * super().forward(observations)
+        return self.scale * super().forward(observations)
 
 
 def test_frozen_parameters_and_unused_ones_have_no_gradient() -> None:
