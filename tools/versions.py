@@ -6,6 +6,7 @@ tools stay those of ``constraints.txt``. What the libraries warn of each other i
 and a training passed; otherwise that of the first command that failed.
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -35,6 +36,8 @@ def main() -> None:
     folder = ROOT / ".cache" / "versions" / which
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
+    if "PIP_FIND_LINKS" in os.environ:  # uv has settings of its own
+        os.environ.setdefault("UV_FIND_LINKS", os.environ["PIP_FIND_LINKS"])
     uv, python = str(Path(sys.executable).with_name("uv")), str(folder / "venv" / "bin" / "python")
 
     pinned = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.split("==")[0] in TEST_TOOLS]
