@@ -2,7 +2,6 @@
 
 import math
 import numbers
-import sys
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -20,7 +19,7 @@ MAX_ENTITIES = 128
 """Most pursuers and obstacles together: a direction's owner is one byte."""
 
 
-def _bounded(default: float, low: float, high: float = math.inf) -> Any:
+def _bounded(default: float, low: float, high: float = 1e6) -> Any:
     return field(default=default, metadata={"low": low, "high": high})
 
 
@@ -133,13 +132,9 @@ class Scenario:
                 f"too many obstacles: {self.pursuers} pursuers and {self.units} obstacles (each disc is one unless "
                 f"composite_unit); at most {MAX_ENTITIES} together can be told apart"
             )
-        try:
-            cover = self.cover
-        except OverflowError as error:
-            raise ValueError("the bodies are too large for the scene") from error
-        if cover > MAX_COVER:
+        if self.cover > MAX_COVER:
             raise ValueError(
-                f"too many bodies to place: obstacles, pursuers and target cover {cover:.0%} of the scene; "
+                f"too many bodies to place: obstacles, pursuers and target cover {self.cover:.0%} of the scene; "
                 f"at most {MAX_COVER:.0%} can be placed at random"
             )
 
@@ -196,9 +191,8 @@ def _check(name: str, value: object, hint: Any, metadata: Any) -> None:
         if isinstance(value, bool) or not isinstance(value, kind):
             raise ValueError(f"{name} must be {'an integer' if hint is int else 'a number'}; got {value!r:.80}")
         low, high = metadata["low"], metadata["high"]
-        if not low <= value <= min(high, sys.float_info.max):
-            allowed = f"between {low:g} and {high:g}" if high < math.inf else f"a finite number of at least {low:g}"
-            raise ValueError(f"{name} must be {allowed}; got {value!r:.80}")
+        if not low <= value <= high:
+            raise ValueError(f"{name} must be between {low:g} and {high:g}; got {value!r:.80}")
     elif get_origin(hint) is tuple:
         extras = get_args(Extra)
         if not isinstance(value, tuple) or any(not isinstance(extra, str) or extra not in extras for extra in value):

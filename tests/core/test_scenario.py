@@ -40,9 +40,9 @@ def test_the_limits_are_those_of_the_notes() -> None:
     positive = ("obstacle_radius", "time_step", "max_speed", "acceleration", "pursuer_mass")
     at_least_0 = ("pursuer_radius", "target_radius", "contact_force", "repulsion_softening", "wall_weight")
     assert {f.name: (f.metadata["low"], f.metadata["high"]) for f in NUMBERS} == {
-        **dict.fromkeys(positive, (1e-6, math.inf)),
-        **dict.fromkeys((*at_least_0, "safety_distance", "obstacle_margin"), (0, math.inf)),
-        **dict.fromkeys(("movement_range_limit", "contact_margin", "direction_softening"), (1e-9, math.inf)),
+        **dict.fromkeys(positive, (1e-6, 1e6)),
+        **dict.fromkeys((*at_least_0, "safety_distance", "obstacle_margin"), (0, 1e6)),
+        **dict.fromkeys(("movement_range_limit", "contact_margin", "direction_softening"), (1e-9, 1e6)),
         **dict.fromkeys(("stage_threshold", "damping", "obstacle_limit"), (0, 1)),
         "pursuers": (1, 64),
         "obstacles": (0, 64),
@@ -60,9 +60,7 @@ def test_a_number_out_of_range_or_of_another_type_names_the_field(name: str) -> 
     meta = next(f.metadata for f in NUMBERS if f.name == name)
     kind = HINTS[name]
     below = meta["low"] - 1
-    bad = [below, True, "3", None, [1], math.nan, math.inf, -math.inf]
-    if meta["high"] < math.inf:
-        bad.append(meta["high"] + 1)
+    bad = [below, meta["high"] + 1, True, "3", None, [1], math.nan, math.inf, -math.inf]
     if kind is int:
         bad.append(3.0)
     for value in bad:
@@ -134,11 +132,6 @@ def test_too_many_bodies_to_place_are_refused_by_their_cover() -> None:
     assert "cover 51% of the scene; at most 50%" in refused(obstacles=16)
     # Tunnel: ten discs of 0.4 R: 1.6 R^2
     assert Scenario(scene="tunnel").cover == pytest.approx(math.pi * (1.6 * 0.04 + 4 * 0.0025) / 4)
-
-
-@pytest.mark.parametrize("name", ["obstacle_radius", "pursuer_radius", "target_radius"])
-def test_bodies_whose_cover_no_float_can_hold_are_refused(name: str) -> None:
-    assert refused(**{name: 1e200}) == "the bodies are too large for the scene"
 
 
 def test_more_bodies_than_a_byte_can_number_are_refused() -> None:
@@ -222,8 +215,3 @@ def test_whole_numbers_do_for_any_number() -> None:
     assert Scenario(**whole) == Scenario(**plain)
     assert repr(Scenario(**whole)) == repr(Scenario(**plain))
     assert dynamics.physics_of(Scenario(**whole)).dtype == dynamics.physics_of(Scenario()).dtype, "one compilation"
-
-
-def test_a_huge_whole_number_is_an_ordinary_number() -> None:
-    push(arranged([(0.3, 0.0)], acceleration=10**30))
-    assert refused(acceleration=10**400).startswith("acceleration must be a finite number")

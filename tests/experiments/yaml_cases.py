@@ -166,7 +166,7 @@ OVERRIDES: list[tuple[str, str]] = [
     ("scenario.speed_ratio=.nan", "must be finite; got nan"),
     ("scenario.scene=tunel", "scenario.scene must be one of random, concave, tunnel; got 'tunel'"),
     ("scenario.obstacles=20", "scenario: too many bodies to place"),
-    ("scenario.obstacle_radius=1e200", "scenario: the bodies are too large for the scene"),
+    ("scenario.obstacle_radius=1e200", "scenario.obstacle_radius must be between 1e-06 and 1e+06; got 1e+200"),
     ("scenario.observe_extras=stage", "scenario.observe_extras must be a tuple of"),
     ("scenario.observe_extras=[stages]", "scenario.observe_extras must be a tuple of"),
     ("scenario.pursuers.x=3", "scenario.pursuers must be an integer; got {'x': 3}"),
@@ -237,7 +237,7 @@ SECTION_FILES: list[tuple[str, str, str]] = [
     ("scenario", f"target: {LONG}\n", "scenario.target must be one of"),
     ("scenario", "n_directions: 73\n", "scenario.n_directions must be even"),
     ("scenario", "pursuers: 64\nobstacles: 64\n", "scenario: too many bodies to place: obstacles, pursuers and target"),
-    ("scenario", "pursuer_radius: 1.0e200\n", "scenario: the bodies are too large for the scene"),
+    ("scenario", "pursuer_radius: 1.0e200\n", "scenario.pursuer_radius must be between 0 and 1e+06; got 1e+200"),
     ("scenario", "observe_extras: {stage: true}\n", "scenario.observe_extras must be a tuple of occupied_angle, stage"),
     ("scenario", "3: damping\n", "keys must be strings; got 3"),
 ]  # fmt: skip
