@@ -44,9 +44,10 @@ TINY = (
 FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
 
 
-def tiny(reward: str = "ours", overrides: Sequence[str] = (), **scenario: Any) -> Config:
+def tiny(reward: str = "ours", overrides: Sequence[str] = (), algorithm: str = "maddpg", **scenario: Any) -> Config:
     """A configuration whose training takes half a second."""
-    return load_config(reward, profile="smoke", fields=scenario, overrides=[*TINY, *overrides])
+    overrides = [*TINY, *overrides]
+    return load_config(reward, algorithm=algorithm, profile="smoke", fields=scenario, overrides=overrides)
 
 
 def tiny_arguments(*more: str) -> list[str]:

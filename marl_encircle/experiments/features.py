@@ -1,7 +1,5 @@
 """What the networks read in place of the bare observation."""
 
-from collections.abc import Mapping
-
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -33,22 +31,23 @@ class RelativeFeatures(BaseFeaturesExtractor):
         :param observations: shape (B, O)
         """
         parts = {name: observations[:, part] for name, part in self.parts.items()}
-        others, obstacles = (self._seen_from_target(parts, name) for name in ("pursuers", "obstacles"))
+        others, obstacles = (_pairs(parts[name]) - parts["target"][:, None] for name in ("pursuers", "obstacles"))
         nearest_first = obstacles.norm(dim=2).argsort(dim=1)
         for name in self.parts.keys() & {"obstacles", "obstacle_directions"}:
-            parts[name] = _in_order(parts[name].reshape(obstacles.shape), nearest_first).flatten(1)
-        obstacles = _in_order(obstacles, nearest_first)
-        seen = [part.flatten(1) for r in (others, obstacles) for part in (r, self._direction(r))]
+            parts[name] = _in_order(_pairs(parts[name]), nearest_first).flatten(1)
+        seen_from_target = others, _in_order(obstacles, nearest_first)
+        seen = [part.flatten(1) for offsets in seen_from_target for part in (offsets, self._direction(offsets))]
         return th.cat([*parts.values(), *seen], dim=1)
-
-    @staticmethod
-    def _seen_from_target(parts: Mapping[str, th.Tensor], name: str) -> th.Tensor:
-        """Return the offsets of the other pursuers or of the obstacles from the target, shape (B, K, 2)."""
-        return parts[name].reshape(len(parts[name]), -1, 2) - parts["target"][:, None]
 
     def _direction(self, offsets: th.Tensor) -> th.Tensor:
         distance: th.Tensor = offsets.norm(dim=2, keepdim=True)
         return offsets / (distance + self.softening)
+
+
+def _pairs(part: th.Tensor) -> th.Tensor:
+    """Return vectors that lie side by side, (B, 2 K), below each other, (B, K, 2)."""
+    pairs: th.Tensor = part.unflatten(1, (part.shape[1] // 2, 2))  # type: ignore[no-untyped-call]  # torch does not type it
+    return pairs
 
 
 def _in_order(rows: th.Tensor, order: th.Tensor) -> th.Tensor:

@@ -7,7 +7,14 @@ from typing import NamedTuple
 
 from marl_encircle.experiments.records import Cell, Setting
 
-LABELS = {"ma2019": "Ma", "model_a": "Model A", "model_b": "Model B", "model_c": "Model C", "ours": "Ours"}
+LABELS = {
+    "ma2019": "Ma",
+    "model_a": "Model A",
+    "model_b": "Model B",
+    "model_c": "Model C",
+    "ours": "Ours",
+    "ours_plus": "Ours+",
+}
 TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
 """Methods of Tables 2-4 in the paper's order; others follow by name."""
 

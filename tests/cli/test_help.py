@@ -182,17 +182,17 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     [
         ("train --reward m", ["ma2019", "model_a", "model_b", "model_c"]),
         ("train --scenario ", ["centre", "default", "paper"]),
-        ("train --algorithm ", ["maddpg", "matd3"]),
+        ("train --algorithm ", ["maddpg", "matd3", "matd3_relative"]),
         ("train --scene t", ["tunnel"]),
         ("train --engine n", ["native"]),
-        ("watch o", ["ours"]),
-        ("watch --versus o", ["ours"]),
-        ("sweep ", ["all", "committed", "smoke"]),
+        ("watch o", ["ours", "ours_plus"]),
+        ("watch --versus o", ["ours", "ours_plus"]),
+        ("sweep ", ["all", "beyond", "committed", "smoke"]),
         ("tables --grid s", ["smoke"]),
         ("calibrate ", ["calibration"]),
         ("tune ", ["default"]),
         ("config validate p", ["paper"]),
-        ("config diff ours o", ["ours"]),
+        ("config diff ours o", ["ours", "ours_plus"]),
         ("train --reward ablations/", []),  # the shell goes on with files
     ],
 )

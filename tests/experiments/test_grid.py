@@ -43,6 +43,20 @@ def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
     assert {job.seed for job in grid.jobs}.isdisjoint({900, 901, 902})
 
 
+def test_what_goes_beyond_the_paper_has_the_settings_seeds_and_rounds_of_the_study() -> None:
+    study, beyond = load_grid("all"), load_grid("beyond")
+    of_ours = {(job.setting, job.seed) for job in study.jobs if job.reward == "ours"}
+    assert {(job.setting, job.seed) for job in beyond.jobs} == of_ours
+    assert beyond.elsewhere == study.elsewhere
+    for job in beyond.jobs:
+        mine, ours = job.config, Job("ours", job.setting, 0, "full", "paper").config
+        assert (mine.scenario, mine.evaluation, mine.training.curriculum) == (
+            ours.scenario,
+            ours.evaluation,
+            ours.training.curriculum,
+        )
+
+
 def test_without_obstacles_model_a_has_the_runs_of_ours() -> None:
     setting = Setting(1.1, 3, 0)
     for name in ("committed", "all"):
@@ -219,8 +233,8 @@ def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:
     ("name", "reason"),
     [
         ("al", "did you mean all?"),
-        ("nope", "known: all, committed, smoke"),
-        ("calibration", "known: all, committed, smoke"),
+        ("nope", "known: all, beyond, committed, smoke"),
+        ("calibration", "known: all, beyond, committed, smoke"),
         ("absent.yaml", "No such file"),
     ],
 )

@@ -275,12 +275,16 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
 @pytest.mark.parametrize(
     ("engine", "algorithm", "vec_step"),
     # before the first step; among random actions; before and after the buffer is full; in the midst of rounds
-    [*(("native", "maddpg", step) for step in (0, 7, 33, 71)), ("native", "matd3", 50), ("supersuit", "maddpg", 50)],
+    [
+        *(("native", "maddpg", step) for step in (0, 7, 33, 71)),
+        *(("native", algorithm, 50) for algorithm in ("matd3", "matd3_relative")),
+        ("supersuit", "maddpg", 50),
+    ],
 )
 def test_a_stopped_training_goes_on_bit_for_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine, algorithm: str, vec_step: int
 ) -> None:
-    config = tiny(overrides=[f"algorithm.name={algorithm}"])
+    config = tiny(algorithm=algorithm)
     ends = keep_the_end(monkeypatch)
     whole, _ = train.train(config, 0, engine, tmp_path / "whole")
     with monkeypatch.context() as patch:
