@@ -44,7 +44,7 @@ def test_a_failing_call_ends_the_command_with_1_and_its_repetition_with_0(
         assert done.code in (0, 1), done.err
         if done.code:
             failed += 1
-            (line,) = [line for line in done.err.splitlines() if line]
+            (line,) = [line for line in done.err.splitlines() if line and not line.startswith("warning: ")]
             assert line.startswith("error: ")
             assert str(folder) in line
         assert temporary_files(folder) == []
