@@ -52,7 +52,7 @@ class JointReplayBuffer(ReplayBuffer):
             )
         self.n_agents = n_agents
         self.n_steps = n_steps
-        self.gamma = gamma
+        self.gamma = float(gamma)  # numpy's own would make the sums more precise than the networks
         self.n_worlds = n_envs // n_agents
 
     def add(

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from slot_envs import LabelledWorlds
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -126,6 +127,13 @@ def test_a_sum_does_not_run_from_the_newest_step_into_the_oldest() -> None:
     steps = sample.next_observations[:, 0, 2] - sample.observations[:, 0, 2]
     assert set(steps.tolist()) == {1, 2, 3, 4}
     assert sample.next_observations[..., 2].max() == 13
+
+
+def test_sums_have_the_precision_of_the_rewards_whatever_gammas_is() -> None:
+    buffer = make_buffer(n_steps=3, gamma=np.float64(0.9))
+    fill(buffer, 8)
+    sample = buffer.sample(10)
+    assert (sample.rewards.dtype, sample.discounts.dtype) == (th.float32, th.float32)
 
 
 def test_slots_must_be_whole_worlds() -> None:
