@@ -155,6 +155,9 @@ def load_grid(name: str) -> Grid:
                 first = Job(method, setting, 0, grid.profile, *names, tuple(group.overrides))
                 with naming_file(path):
                     config = first.config
+                    if config.cell.setting != setting:
+                        given = ", ".join(group.overrides)
+                        raise ConfigError(f"overrides: the setting belongs to settings; got {given!r:.80}")
                     for seed in group.seeds:
                         check_seed(config, seed)
                 cell = config.cell

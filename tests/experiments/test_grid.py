@@ -132,6 +132,12 @@ def test_a_group_may_change_the_configurations_of_its_runs(tmp_path: Path) -> No
     assert all(arguments(job)[-2:] == ["--set", "algorithm.gamma=0.5"] for job in jobs)
 
 
+def test_a_group_may_not_change_the_setting_of_its_runs(tmp_path: Path) -> None:
+    text = GRID.format(method="model_b").replace("seeds:", "overrides: [scenario.pursuers=4]\n    seeds:")
+    with pytest.raises(ConfigError, match=r"grid\.yaml: overrides: the setting belongs to settings; got .*pursuers=4"):
+        grid_of(tmp_path, text)
+
+
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
     for scale in (0.1, 0.2):
         (tmp_path / "idea.yaml").write_text(f"base: ours\nscale: {scale}\n")
