@@ -49,10 +49,10 @@ def show(
 ) -> None:
     """Print a resolved configuration; the reward as a table of terms and weights."""
     config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
-    values = config.to_dict()
     if as_json:
-        typer.echo(json.dumps(values, indent=2))
+        typer.echo(json.dumps(config.to_dict(), indent=2))
         return
+    values = config.with_defaults()
     console = Console()
     console.print(_reward_table(config))
     for section in ("scenario", "algorithm", "training", "evaluation"):

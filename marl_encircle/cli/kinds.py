@@ -103,9 +103,9 @@ def _section(kind: Kind, model: type[BaseModel]) -> Callable[[str], dict[str, An
 
 
 _CHECKS: Mapping[Kind, Callable[[str], dict[str, Any]]] = {
-    "reward": lambda name: load_config(name).to_dict(),
-    "scenario": lambda name: load_config(scenario=name).to_dict(),
-    "algorithm": lambda name: load_config(algorithm=name).to_dict(),
+    "reward": lambda name: load_config(name).with_defaults(),
+    "scenario": lambda name: load_config(scenario=name).with_defaults(),
+    "algorithm": lambda name: load_config(algorithm=name).with_defaults(),
     "training": _section("training", TrainingConfig),
     "evaluation": _section("evaluation", EvaluationConfig),
     "grid": _grid,

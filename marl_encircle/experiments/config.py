@@ -126,8 +126,13 @@ class AlgorithmConfig(Section):
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        defaults = {name: field.default for name, field in type(self).model_fields.items() if not field.is_required()}
+        defaults = self.defaults()
         return {key: value for key, value in handler(self).items() if key not in defaults or value != defaults[key]}
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """Return the values of the keys that have one by default."""
+        return {name: field.default for name, field in cls.model_fields.items() if not field.is_required()}
 
 
 class Ramp(Section):
@@ -184,6 +189,11 @@ class Config(Section):
         """Return the resolved configuration as plain data."""
         sections = self.model_dump(exclude={"scenario"})
         return {"reward": sections.pop("reward"), "scenario": fields_of(self.scenario), **sections}
+
+    def with_defaults(self) -> dict[str, Any]:
+        """Return what :meth:`to_dict` does, with the keys that it leaves out."""
+        values = self.to_dict()
+        return {**values, "algorithm": {**values["algorithm"], **(self.algorithm.defaults() | values["algorithm"])}}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":

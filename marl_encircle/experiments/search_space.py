@@ -168,7 +168,7 @@ class Space(NamedTuple):
     @property
     def base(self) -> dict[str, Any]:
         """The values of the dimensions in the files that are searched from, as far as they are among those tried."""
-        config = self.jobs({})[0].config.to_dict()
+        config = self.jobs({})[0].config.with_defaults()
         values = {key: _value_at(config, key) for key in self.dimensions}
         return {key: value for key, value in values.items() if _is_tried(self.dimensions[key], value)}
 

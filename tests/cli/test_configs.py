@@ -26,6 +26,12 @@ def test_config_show_prints_terms_and_weights_and_every_section(run: Run) -> Non
     assert "methods: ma2019, model_a, model_b, model_c, ours, ours_plus" in out
 
 
+def test_config_show_prints_keys_that_a_record_leaves_out(run: Run) -> None:
+    rows = [line.split() for line in run("config", "show").out.splitlines()]
+    assert ["n_steps", "1"] in rows
+    assert ["features", "observation"] in rows
+
+
 def test_config_show_as_json_is_the_resolved_configuration(run: Run) -> None:
     done = run("config", "show", "--profile", "smoke", "--obstacles", "2", "--set", "training.n_worlds=3", "--json")
     expected = load_config(profile="smoke", fields={"obstacles": 2}, overrides=["training.n_worlds=3"])
@@ -47,6 +53,9 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
     found = {"scenario.acceleration": [5.0, 3.0], "scenario.turn_order": ["pursuers_first", "simultaneous"]}
     assert json.loads(run("config", "diff", "centre", mine, "--json").out) == found
     assert run("config", "diff", "paper", mine).out == "no difference\n"
+    found = json.loads(run("config", "diff", "maddpg", "matd3_relative", "--json").out)
+    assert found["algorithm.n_steps"] == [1, 3]
+    assert found["algorithm.features"] == ["observation", "relative"]
     found = json.loads(run("config", "diff", "committed", "smoke", "--json").out)
     assert found["profile"] == ["full", "smoke"]
     assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[0], [900]]

@@ -49,6 +49,12 @@ def test_dimensions_have_the_names_of_the_keys_that_they_move(tmp_path: Path) ->
     }
 
 
+def test_keys_that_a_record_leaves_out_are_tried_first_with_their_defaults(tmp_path: Path) -> None:
+    search = "{algorithm: {n_steps: {low: 1, high: 5}, features: {choices: [relative, observation]}}}"
+    base = load_space(search_file(tmp_path, search=search)).base
+    assert base == {"algorithm.n_steps": 1, "algorithm.features": "observation"}
+
+
 def test_values_in_use_that_are_not_tried_are_left_to_chance(tmp_path: Path) -> None:
     search = (
         "{algorithm: {gamma: {choices: [0.8, 0.95]}, tau: {low: 0.02, high: 0.1}, batch_size: {low: 16, high: 64, "
