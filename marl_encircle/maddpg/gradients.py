@@ -1,7 +1,7 @@
 """The losses of Eq. 2 and 3 and their gradients, set as the parameters' ``grad``.
 
-By hand, which takes two thirds of the time, where every module is one of those that this file knows and has no hook; by
-autograd wherever something else may stand between a parameter and the loss.
+By hand, which takes two thirds of the time, where every module between a parameter and the loss is one of those that
+this file knows and has no hook; by autograd wherever something else may stand there.
 
 Shape legend: B minibatch, N agents, O observation size, U action size.
 """
@@ -9,15 +9,13 @@ Shape legend: B minibatch, N agents, O observation size, U action size.
 from collections.abc import Iterable
 
 import torch as th
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from torch.nn import functional
 
 from marl_encircle.maddpg.models import Actor, CentralCritic
-from marl_encircle.maddpg.networks import AgentFeatures, StackedMLP
+from marl_encircle.maddpg.networks import StackedMLP
 
-PLAIN = {Actor, CentralCritic, StackedMLP, AgentFeatures, FlattenExtractor}
-PLAIN |= {nn.Flatten, nn.ModuleList, nn.ParameterList, nn.ReLU}
+PLAIN = {Actor, CentralCritic, StackedMLP, nn.ModuleList, nn.ParameterList, nn.ReLU}
 """Types of the modules whose arithmetic is known; a subclass may compute something else."""
 
 
@@ -78,12 +76,12 @@ def is_plain(model: Actor | CentralCritic) -> bool:
     That is: ReLU networks of one or more hidden layers, on features that have nothing to learn, none shared by two
     estimates; no subclass or parametrisation, no hook, no frozen parameter, no autocast.
     """
-    learns_features = any(True for _ in model.features_extractor.parameters())
-    features = set() if learns_features else set(model.features_extractor.modules())
+    features = set(model.features_extractor.modules())
     modules = [module for module in model.modules() if module not in features]
     networks = [module for module in modules if type(module) is StackedMLP]
     return (
-        all(type(module) in PLAIN for module in modules)
+        not any(True for _ in model.features_extractor.parameters())
+        and all(type(module) in PLAIN for module in modules)
         and all(type(network.activation) is nn.ReLU and len(network.weights) for network in networks)
         and len(networks) == (len(model.q_networks) if isinstance(model, CentralCritic) else 1)
         and not any(_has_hooks(module) for module in modules)

@@ -122,6 +122,10 @@ def subclass(model: Any, network: StackedMLP) -> None:
     model.__class__ = type("Mine", (type(model),), {})
 
 
+def learn_features(model: Any, network: StackedMLP) -> None:
+    model.features_extractor.register_parameter("scale", nn.Parameter(th.ones(1)))
+
+
 CHANGES = [
     freeze,
     hook_a_parameter,
@@ -132,6 +136,7 @@ CHANGES = [
     parametrize_a_hidden_layer,
     replace_the_activation,
     subclass,
+    learn_features,
 ]
 
 
