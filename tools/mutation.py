@@ -206,7 +206,9 @@ def _move_into(queue: Any) -> None:
     """Work in a copy of one's own from now on, and never in the checkout."""
     copy: Path = queue.get()
     os.chdir(copy)
-    os.environ.update(ENVIRONMENT, PYTHONPATH=str(copy), MARL_ENCIRCLE_CACHE=str(copy / ".cache"))
+    # Others' pytests would clear the same temporary folders away at the same time.
+    own = {"PYTHONPATH": str(copy), "MARL_ENCIRCLE_CACHE": str(copy / ".cache"), "PYTEST_DEBUG_TEMPROOT": str(copy)}
+    os.environ.update(ENVIRONMENT | own)
     code = "import marl_encircle; print(marl_encircle.__file__)"
     used = subprocess.run([sys.executable, "-c", code], cwd="/", check=True, capture_output=True, text=True).stdout
     if not Path(used.strip()).is_relative_to(copy):
