@@ -160,7 +160,7 @@ class MADDPG(OffPolicyAlgorithm):
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
         self.n_agents = count_agents(self.env, self.n_agents)
-        self.agents = names_of_agents(self.env) or self.agents
+        self.agents = names_of_agents(self.env, self.n_agents) or self.agents
         # The exploration's own generator goes on where a loaded model stopped
         super().set_random_seed(self.seed)
 
@@ -214,8 +214,9 @@ class MADDPG(OffPolicyAlgorithm):
         :param force_reset: whether it is reset before training
         :raises ValueError: where the number of agents differs
         """
-        count_agents(env, self.n_agents)
+        n_agents = count_agents(env, self.n_agents)
         super().set_env(env, force_reset)
+        self.agents = self.policy.agents = names_of_agents(env, n_agents) or self.agents
 
     def train(self, gradient_steps: int, batch_size: int = 1024) -> None:
         """Update critics, actors and targets from the replay buffer.
@@ -526,7 +527,12 @@ def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
     return n
 
 
-def names_of_agents(env: GymEnv | None) -> tuple[str, ...] | None:
-    """Return the agents' names in the order of the slots, None where the environment has no attribute ``agents``."""
+def names_of_agents(env: GymEnv | None, n_agents: int) -> tuple[str, ...] | None:
+    """Return the agents' names in the order of the slots.
+
+    :param env: an environment tells them by an attribute ``agents``
+    :param n_agents: number of agents N
+    :return: None where there is no such attribute, or it does not name each agent of a world
+    """
     agents = getattr(env, "agents", None) if isinstance(env, VecEnv) else None
-    return tuple(agents) if agents else None
+    return tuple(agents) if isinstance(agents, list | tuple) and len(agents) == n_agents else None

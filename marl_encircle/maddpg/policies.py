@@ -197,7 +197,7 @@ class MADDPGPolicy(BasePolicy):
             return super().predict(observation, state, episode_start, deterministic)
         agents = self.agents or tuple(observation)
         if len(agents) != self.n_agents or set(agents) != set(observation):
-            wanted = ", ".join(self.agents) if self.agents else f"all {self.n_agents} agents"
+            wanted = ", ".join(map(str, self.agents)) if self.agents else f"all {self.n_agents} agents"
             raise ValueError(f"predict needs the observations of {wanted}, but got {list(observation)}")
         slots = np.stack([observation[agent] for agent in agents])
         actions, state = super().predict(slots, state, episode_start, deterministic)

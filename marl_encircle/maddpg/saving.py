@@ -41,6 +41,7 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
     prefix = "actor."
     policy.actor.load_state_dict({name.removeprefix(prefix): saved[name] for name in saved if name.startswith(prefix)})
     policy.set_training_mode(False)
+    policy.agents = data.get("agents")
     return policy
 
 

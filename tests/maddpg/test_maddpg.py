@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMoni
 
 from marl_encircle.maddpg import MADDPG, MATD3, MADDPGPolicy, UntrustedFileWarning
 from marl_encircle.maddpg.models import Actor
+from marl_encircle.maddpg.saving import load_actors
 
 ALGORITHMS = [MADDPG, MATD3]
 CRITICS = ["per_agent", "shared"]
@@ -532,6 +533,31 @@ def test_a_dict_is_read_by_name_where_the_environment_names_its_agents(tmp_path:
             assert all((actions[name] == expected[name]).all() for name in Named.agents)
             with pytest.raises(ValueError, match="observations of left, middle, right"):
                 same.predict({f"agent_{i}": np.zeros(3) for i in range(3)})
+        actions, _ = load_actors(tmp_path / "model.zip").predict({name: obs[name] for name in reversed(Named.agents)})
+        assert all((actions[name] == expected[name]).all() for name in Named.agents)
+
+
+def test_the_names_are_those_of_the_environment_that_is_set_last() -> None:
+    class Named(LabelledWorlds):
+        agents = ("left", "middle", "right")
+
+    class Numbered(LabelledWorlds):
+        agents = (2, 1, 0)
+
+    model = make_model(env=Named())
+    model.set_env(Numbered())
+    assert model.policy.agents == model.agents == (2, 1, 0)
+    with pytest.raises(ValueError, match="observations of 2, 1, 0"):
+        model.predict(dict.fromkeys(Named.agents, np.zeros(3)))
+    model.set_env(LabelledWorlds())
+    assert model.policy.agents == (2, 1, 0)
+
+
+@pytest.mark.parametrize("agents", [3, "abc", ["left", "right"]], ids=repr)
+def test_what_does_not_name_each_agent_of_a_world_is_no_names(agents: Any) -> None:
+    env = LabelledWorlds()
+    env.agents = agents
+    assert make_model(env=env).policy.agents is None
 
 
 @pytest.mark.parametrize(
