@@ -30,7 +30,10 @@ from marl_encircle.experiments.yaml_files import ConfigError
     [
         ("speed_ratio={start: 0.5, world_steps: 9}", "speed_ratio.start: scenario.speed_ratio must be between"),
         ("obstacle_radius={start: 0.9, world_steps: 9}", "obstacle_radius.start: scenario: too many bodies"),
-        ("obstacle_radius={start: 1e200, world_steps: 9}", "obstacle_radius.start: scenario: the bodies are too large"),
+        (
+            "obstacle_radius={start: 1e200, world_steps: 9}",
+            "obstacle_radius.start: scenario.obstacle_radius must be between 1e-06 and 1e+06; got 1e+200",
+        ),
     ],
 )
 def test_a_first_value_that_cannot_be_played_is_refused_for_a_training_with_the_remedy(ramp: str, reason: str) -> None:

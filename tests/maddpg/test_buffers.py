@@ -139,3 +139,8 @@ def test_sums_have_the_precision_of_the_rewards_whatever_gammas_is() -> None:
 def test_slots_must_be_whole_worlds() -> None:
     with pytest.raises(ValueError, match="10 slots are no whole number of worlds with 3 agents"):
         JointReplayBuffer(100, OBSERVATION, ACTION, n_envs=10, n_agents=3)
+
+
+def test_a_sum_of_no_rewards_is_refused() -> None:
+    with pytest.raises(ValueError, match="n_steps must be at least 1, but got 0"):
+        make_buffer(n_steps=0)

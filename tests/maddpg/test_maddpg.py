@@ -82,6 +82,8 @@ def test_the_defaults_are_those_of_the_documentation() -> None:
             "progress_bar": False,
         }
     assert defaults(MADDPG.train) == {"batch_size": 1024}
+    of_policy = defaults(MADDPGPolicy)
+    assert (of_policy["n_critics"], of_policy["normalize_images"], of_policy["share_parameters"]) == (1, True, False)
     assert (MADDPG.n_critics, MATD3.n_critics) == (1, 2)
     policy = MADDPG("MlpPolicy", LabelledWorlds(), device="cpu", buffer_size=120).policy
     for network in (policy.actor.mu, *policy.critic.networks):
