@@ -29,7 +29,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-@pytest.mark.parametrize(("name", "every"), [("train", 13), ("tables", 9)])
+@pytest.mark.parametrize(("name", "every"), [("train", 29), ("tables", 17)])
 def test_a_failing_call_ends_the_command_with_1_and_its_repetition_with_0(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, every: int
 ) -> None:

@@ -3,9 +3,11 @@
 YAML 1.2 by ruamel.yaml: ``1e-3`` is a number, ``no`` is a word, a duplicate key is an error.
 """
 
+import copy
 import datetime
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +62,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the plain data that a YAML text holds.
+    """Return the plain data that a YAML text holds, the caller's to change.
 
     :raises ConfigError: see :func:`read_yaml`
     """
     _check_length(text)
+    return copy.deepcopy(_parse(text))
+
+
+@lru_cache(maxsize=128)
+def _parse(text: str) -> Any:
+    """Parse a text once: the many jobs of a grid share few files."""
     yaml = YAML(typ="safe", pure=True)
     try:
         _refuse_tricks(yaml, text)

@@ -1,5 +1,6 @@
 """A sweep on a Ray cluster makes the same runs as one on this machine, each once, whichever node dies."""
 
+import json
 import os
 import signal
 import socket
@@ -55,7 +56,23 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     signal.signal(signal.SIGTERM, handler)
 
 
+def trainer_of(folder: Path) -> int:
+    """The process that trains a run, else 0."""
+    try:
+        return int(json.loads((folder / locks.LOCK_NAME).read_text())["pid"])
+    except (FileNotFoundError, ValueError):  # not begun, or the lock is not written yet
+        return 0
+
+
+def parent_of(pid: int) -> int | None:
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return None
+
+
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.filterwarnings("ignore")  # Ray's own
 def test_when_a_node_dies_another_goes_on_and_every_run_is_made_once(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -70,8 +87,11 @@ def test_when_a_node_dies_another_goes_on_and_every_run_is_made_once(
 
     def kill_a_node_in_the_midst(p: Progress) -> None:
         assert p.done + len(p.failed) + len(p.running) + p.left == p.total == 3
-        if len(p.running) == 2 and all((run.folder / checkpoint.NAME).exists() for run in p.running):
-            raylet.process.send_signal(signal.SIGKILL)
+        for run in p.running:
+            trainer = trainer_of(run.folder)
+            if (run.folder / checkpoint.NAME).exists() and parent_of(trainer) == raylet.process.pid:
+                raylet.process.send_signal(signal.SIGKILL)
+                os.kill(trainer, signal.SIGKILL)  # a machine that is lost takes all its processes along
 
     start = RayExecutor.start
     monkeypatch.setattr(RayExecutor, "start", train_there)

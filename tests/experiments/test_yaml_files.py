@@ -37,6 +37,11 @@ def test_a_value_is_what_yaml_1_2_says(text: str, value: Any) -> None:
     assert type(read) is type(value)
 
 
+def test_what_a_caller_changes_is_not_seen_by_the_next() -> None:
+    parse_yaml("{a: {b: [1]}}")["a"]["b"].append(2)
+    assert parse_yaml("{a: {b: [1]}}") == {"a": {"b": [1]}}
+
+
 def test_comments_order_and_a_byte_order_mark_are_no_matter(tmp_path: Path) -> None:
     (tmp_path / "f.yaml").write_bytes("# first\nb: 1  # λ\na: 2\n".encode("utf-8-sig"))
     assert list(read_yaml(tmp_path / "f.yaml").items()) == [("b", 1), ("a", 2)]

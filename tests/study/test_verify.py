@@ -79,7 +79,6 @@ def test_a_table_that_the_runs_do_not_give_is_found(results: Path) -> None:
 
 def test_a_figure_that_the_runs_do_not_give_is_found(results: Path) -> None:
     write_figures(GRID, results)
-    assert verify(GRID, results).changed == ()
     picture = results / "figures" / "figure4.svg"
     picture.write_bytes(picture.read_bytes().replace(b"success", b"failure", 1))
     (results / "figures" / "figure6.png").unlink()
