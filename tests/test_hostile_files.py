@@ -35,8 +35,9 @@ from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.build import load_run, policy_bytes
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
-from marl_encircle.experiments.records import read_runs
+from marl_encircle.experiments.records import Episode, episodes_from_csv, read_runs
 from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.study.figures.curves import curve_from_csv
 
 FILES = ("policy.safetensors", "episodes.csv", "progress.csv")
 GRID = """
@@ -203,6 +204,8 @@ DOORS: dict[str, tuple[list[str], list[str]]] = {
     "watch": (["{run}", "--headless", "{root}/pictures"], ["run.json", "policy.safetensors"]),
     "train": (
         tiny_arguments("--out", "{runs}", "--quiet", "--no-tensorboard"), ["run.json", "checkpoint.safetensors"]),
+    "train --json": (tiny_arguments("--out", "{runs}", "--quiet", "--no-tensorboard"), ["episodes.csv"]),
+    "export": (["{run}", "--out", "{root}/actors.onnx"], ["run.json", "policy.safetensors"]),
     "sweep": (["{root}/grid.yaml", "--out", "{runs}"], ["run.json"]),
     "tables": (["--grid", "{root}/grid.yaml", "--out", "{root}/results"], ["run.json", "episodes.csv"]),
     "figures": (
@@ -213,7 +216,7 @@ DOORS: dict[str, tuple[list[str], list[str]]] = {
         ["--grid", "{root}/grid.yaml", "--out", "{root}/results", "--quiet"],
         ["run.json", "policy.safetensors", "episodes.csv"]),
 }  # fmt: skip
-"""Command -> its arguments, and the files of a run that it reads and understands."""
+"""Command, with flags -> its arguments, and the files of a run that it reads and understands."""
 
 YAML_DOORS = [
     ["config", "show", "--reward", "{file}"],
@@ -225,6 +228,7 @@ YAML_DOORS = [
     ["sweep", "{file}"],
     ["tables", "--grid", "{file}", "--out", "{root}/results"],
     ["calibrate", "{file}"],
+    ["tune", "{file}", "--out", "{root}/search"],
     ["watch", "{file}", "--policy", "{run}", "--headless", "{root}/pictures"],
 ]
 
@@ -243,7 +247,7 @@ def test_what_a_stranger_puts_into_a_run_is_refused_and_does_not_run(
     for payload, make in PAYLOADS.items():
         run = place.fresh_run()
         put(run, name, make(place.marker))
-        done = command(capsys, monkeypatch, door, *filled(DOORS[door][0], place, run))
+        done = command(capsys, monkeypatch, *door.split(), *filled(DOORS[door][0], place, run))
         assert (done.code, done.out) == (3, ""), payload
         assert f"error: {run / name}: " in done.err, payload
         assert "Traceback" not in done.err
@@ -558,6 +562,23 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20
+
+
+@pytest.mark.parametrize("rows", ["\n", "1,0\n", "ab,"], ids=["blank", "narrow", "wide"])
+@pytest.mark.parametrize(
+    ("columns", "read"),
+    [(",".join(Episode._fields), episodes_from_csv), ("world_steps,success", curve_from_csv)],
+    ids=["rounds", "curve"],
+)
+def test_a_bomb_of_cells_is_not_unpacked(columns: str, read: Callable[[str], object], rows: str) -> None:
+    """Rows and cells take up to eighty times the memory of their text."""
+    text = f"{columns}\n{rows * (1 << 20)}"[: 1 << 20]
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"^line 2: |must rise|no points"):
+        read(text)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
 
 
 def test_an_archive_that_is_trusted_still_writes_nothing(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from marl_encircle import files
 from marl_encircle.cli.options import (
     OUTPUT,
     Algorithm,
@@ -102,20 +101,19 @@ def _thumbnails(quiet: bool) -> "Draw | None":
 def _outcome(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
     """Return what became of a run; one that diverged has no rounds, and so no success."""
     from marl_encircle.experiments.metrics import summarise_run
-    from marl_encircle.experiments.records import episodes_from_csv
+    from marl_encircle.experiments.records import read_episodes
 
     success = length = None
     if "episodes.csv" in record["sha256"]:
-        data = files.read_bytes(folder / "episodes.csv", sha256=record["sha256"]["episodes.csv"])
-        own = summarise_run(episodes_from_csv(data.decode()), record["config"]["reward"]["closure"])
+        own = summarise_run(read_episodes(folder, record), record["config"]["reward"]["closure"])
         success, length = own.success, own.mean_episode_length
     return {
         "folder": str(folder),
         "status": record["status"],
         "success": success,
         "mean_episode_length": length,
-        "world_steps": record["world_steps"],
-        "cpu_seconds": record["cpu_seconds"],
+        "world_steps": record.get("world_steps"),
+        "cpu_seconds": record.get("cpu_seconds"),
     }
 
 

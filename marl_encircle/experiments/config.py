@@ -31,7 +31,7 @@ from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
 from marl_encircle.experiments.faults import explain, naming_files
 from marl_encircle.experiments.overrides import parse_overrides
-from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.records import MAX_ROUNDS, Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError, merge
 from marl_encircle.spelling import nearest
 
@@ -39,7 +39,7 @@ Profile = Literal["full", "smoke"]
 Features = Literal["observation", "relative"]
 Count = Annotated[int, Field(ge=1, le=10**10)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Episodes = Annotated[int, Field(ge=1, le=10**6)]
+Episodes = Annotated[int, Field(ge=1, le=MAX_ROUNDS)]
 
 MAX_POLICY_BYTES = 1 << 26
 """Largest ``policy.safetensors`` that is read back."""

@@ -5,7 +5,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast, get_type_hints
@@ -17,6 +17,10 @@ from marl_encircle.core.simulator import world_seeds
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
 MAX_FILE = 1 << 28
+MAX_ROUNDS = 10**6
+"""Of an evaluation."""
+MAX_LINE = 10_000
+"""Characters of a line of a CSV file: cells take twenty times the memory of their text."""
 _RECORD_KEYS = ("status", "method", "seed", "config", "config_hash", "sha256")
 
 
@@ -118,20 +122,32 @@ def episodes_from_csv(text: str) -> list[Episode]:
 
     :param text: content of the file
     :raises ValueError: for another header, a value of the wrong kind or out of range, with line and column; without
-        rounds; for a duplicate round number
+        rounds or with too many; for a duplicate round number
     """
+    reader = csv.reader(csv_lines(text))
+    episodes: list[Episode] = []
     try:
-        lines = list(csv.reader(io.StringIO(text)))
+        if tuple(next(reader, ())) != Episode._fields:
+            raise ValueError(f"line 1: the columns must be {','.join(Episode._fields)}")
+        for number, cells in enumerate(reader, start=2):
+            if len(episodes) == MAX_ROUNDS:
+                raise ValueError(f"more than {MAX_ROUNDS} rounds")
+            episodes.append(_episode(cells, number))
     except csv.Error as error:
         raise ValueError(f"not CSV: {error}") from error
-    if not lines or tuple(lines[0]) != Episode._fields:
-        raise ValueError(f"line 1: the columns must be {','.join(Episode._fields)}")
-    episodes = [_episode(cells, number) for number, cells in enumerate(lines[1:], start=2)]
     if not episodes:
         raise ValueError("no rounds")
     if len({episode.round for episode in episodes}) != len(episodes):
         raise ValueError("duplicate round number")
     return episodes
+
+
+def csv_lines(text: str) -> Iterator[str]:
+    """Yield the lines of a stranger's CSV text; a ValueError ends it at one that is too long."""
+    for number, line in enumerate(io.StringIO(text), start=1):
+        if len(line) > MAX_LINE:
+            raise ValueError(f"line {number}: longer than {MAX_LINE} characters")
+        yield line
 
 
 def _episode(cells: list[str], line: int) -> Episode:
@@ -245,19 +261,31 @@ def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
             raise files.DamagedFileError(folder / "episodes.csv", "its hash is not in run.json")
         return Run(cell, seed, "not evaluated", closure)
     asked = record["config"]["evaluation"]
-    episodes = _episodes_of(folder / "episodes.csv", contents, asked)
+    episodes = _episodes_of(folder / "episodes.csv", contents["episodes.csv"], asked)
     elsewhere = {}
     for name in contents:
         setting = _setting_of(name.removeprefix("episodes_").removesuffix(".csv"))
         if setting is not None and name == episodes_name(setting):
-            elsewhere[setting] = _episodes_of(folder / name, contents, asked)
+            elsewhere[setting] = _episodes_of(folder / name, contents[name], asked)
     return Run(cell, seed, "finished", closure, episodes, elsewhere)
 
 
-def _episodes_of(path: Path, contents: Mapping[str, bytes], asked: Mapping[str, int]) -> tuple[Episode, ...]:
+def read_episodes(folder: Path, record: Mapping[str, Any], setting: Setting | None = None) -> tuple[Episode, ...]:
+    """Return the evaluation rounds of a run folder that its record vouches for.
+
+    :param record: content of its ``run.json``, see :func:`read_record`
+    :param setting: where the rounds were played; by default where the run was trained
+    :raises files.DamagedFileError: if they are not what the run wrote
+    """
+    path = folder / episodes_name(setting)
+    data = files.read_bytes(path, sha256=record["sha256"][path.name], max_bytes=MAX_FILE)
+    return _episodes_of(path, data, record["config"]["evaluation"])
+
+
+def _episodes_of(path: Path, data: bytes, asked: Mapping[str, int]) -> tuple[Episode, ...]:
     """Return the rounds of a file, which must be those that the run's evaluation section asks for."""
     try:
-        episodes = episodes_from_csv(contents[path.name].decode("utf-8"))
+        episodes = episodes_from_csv(data.decode("utf-8"))
     except ValueError as error:
         raise files.DamagedFileError(path, str(error)) from error
     n, seed = asked["episodes"], asked["seed"]

@@ -6,7 +6,6 @@ selection rounds, which are never reported.
 
 import csv
 import errno
-import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ from marl_encircle import files
 from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.descriptions import CURVES, describe
-from marl_encircle.experiments.records import MAX_FILE, read_record
+from marl_encircle.experiments.records import MAX_FILE, csv_lines, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -188,7 +187,7 @@ def _write_curve(run: Path, folder: Path) -> None:
     with SummaryWriter(folder) as writer:
         describe(writer, config, record["seed"], CURVES)
         try:
-            for row in csv.DictReader(io.StringIO(data.decode())):
+            for row in csv.DictReader(csv_lines(data.decode())):
                 steps = int(row.pop("world_steps")) * config.scenario.pursuers
                 for name, value in row.items():
                     if value:

@@ -7,7 +7,6 @@ one goes on with the trials that were under way.
 """
 
 import csv
-import io
 import json
 import time
 from collections import Counter
@@ -23,7 +22,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor, Process
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import MAX_FILE
+from marl_encircle.experiments.records import MAX_FILE, csv_lines
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
@@ -169,7 +168,7 @@ class _Attempt:
             return []
         try:
             text = files.read_bytes(path, max_bytes=MAX_FILE).decode()
-            curve = [float(row["success"]) for row in csv.DictReader(io.StringIO(text))]
+            curve = [float(row["success"]) for row in csv.DictReader(csv_lines(text))]
         except (ValueError, KeyError, TypeError, csv.Error) as error:
             if isinstance(error, files.DamagedFileError):
                 raise

@@ -16,7 +16,7 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.metrics import wilson_interval
 from marl_encircle.experiments.provenance import cpu_model
-from marl_encircle.experiments.records import Cell, Episode, Setting, episodes_from_csv, episodes_name
+from marl_encircle.experiments.records import Cell, Episode, Setting, episodes_name, read_episodes
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study.reproduce import render
 
@@ -70,7 +70,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
             name = episodes_name(setting)
             if name not in record["sha256"]:
                 continue
-            recorded = episodes_from_csv(files.read_bytes(folder / name).decode())
+            recorded = read_episodes(folder, record, setting)
             played = play_rounds(policy, config, len(recorded), config.evaluation.seed, setting)
             rounds += len(recorded)
             equal += count_equal(recorded, played, same_processor)

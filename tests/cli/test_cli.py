@@ -66,6 +66,9 @@ def test_train_as_json_is_one_object(run: Run, runs: Path) -> None:
     assert found["success"] == rounds["success"] > 0
     assert found["mean_episode_length"] == rounds["mean_episode_length"]
     assert json.loads(run(*arguments).out) == found
+    record = json.loads((folder / "run.json").read_text())
+    files.write_json(folder / "run.json", {key: record[key] for key in record if key != "cpu_seconds"})
+    assert json.loads(run(*arguments).out) == {**found, "cpu_seconds": None}
     (folder / "episodes.csv").write_text("edited")
     assert run(*arguments).code == 3
 

@@ -51,7 +51,8 @@ def test_numpy_scalars_are_written_like_pythons() -> None:
         ("-1.5,", "nan,", "line 2, return_mean: 'nan' is out of range"),
         ("1,1001,", "0,1000,", "duplicate round number"),
         ("1000", "9" * 400, "line 2, seed: .* is out of range"),
-        ("1000", "1" * 200_000, "not CSV"),
+        ("1000", "1" * 200_000, "line 2: longer than 10000 characters"),
+        ("1000", "10\r00", "not CSV"),
         ("\n0,1000,10,,60,-1.5,0.25,2,0\n1,1001,,,60,-1.5,0.25,2,0", "", "no rounds"),
     ],
 )
@@ -60,6 +61,14 @@ def test_a_row_that_cannot_be_is_refused_by_line_and_column(old: str, new: str, 
     assert old in text
     with pytest.raises(ValueError, match=where):
         records.episodes_from_csv(text.replace(old, new, 1))
+
+
+def test_there_are_as_many_rounds_as_an_evaluation_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "MAX_ROUNDS", 2)
+    texts = [records.episodes_to_csv([episode(number, 10) for number in range(total)]) for total in (2, 3)]
+    assert len(records.episodes_from_csv(texts[0])) == 2
+    with pytest.raises(ValueError, match="more than 2 rounds"):
+        records.episodes_from_csv(texts[1])
 
 
 # run folders

@@ -225,7 +225,8 @@ def test_points_that_a_seed_lacks_are_left_out() -> None:
         ("world_steps,success\n3,0.1\n3,0.1\n", "world_steps must rise"),
         ("world_steps,success\n-3,0.1\n", "world_steps must rise"),
         (f"world_steps,success\n{'9' * 30},0.1\n", "world_steps: too large"),
-        (f"world_steps,success\n3,{'1' * 200_000}\n", "not CSV"),
+        (f"world_steps,success\n3,{'1' * 200_000}\n", "line 2: longer than 10000 characters"),
+        ("world_steps,success\n3,0\r1\n", "not CSV"),
     ],
 )
 def test_a_learning_curve_that_cannot_be_is_refused(text: str, reason: str) -> None:

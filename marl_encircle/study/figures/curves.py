@@ -1,7 +1,6 @@
 """Figure 4: success over training, from the learning curves of runs."""
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from marl_encircle.envs.palette import SERIES, Series
 from marl_encircle.experiments.metrics import share_interval
-from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.records import Cell, Setting, csv_lines
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.study.paper import label
 
@@ -63,23 +62,26 @@ def curve_from_csv(text: str) -> Curve:
     :raises ValueError: without points, without the columns ``world_steps`` and ``success``, or for what is no count of
         steps, rising, or no share in them
     """
+    steps: list[int] = []
+    shares: list[float] = []
     try:
-        rows = list(csv.DictReader(io.StringIO(text)))
-        steps = np.array([int(row["world_steps"]) for row in rows], np.int64)
-        success = np.array([float(row["success"]) for row in rows])
+        for row in csv.DictReader(csv_lines(text)):
+            steps.append(int(row["world_steps"]))
+            shares.append(float(row["success"]))
+            if steps[-1] <= max(steps[-2:-1], default=-1):
+                raise ValueError("world_steps must rise from line to line")
+        curve = Curve(np.array(steps, np.int64), np.array(shares))
     except csv.Error as error:
         raise ValueError(f"not CSV: {error}") from error
     except OverflowError as error:
         raise ValueError("world_steps: too large") from error
     except (KeyError, TypeError) as error:
         raise ValueError("world_steps and success must be in every line") from error
-    if not rows:
+    if not steps:
         raise ValueError("no points")
-    if steps[0] < 0 or (np.diff(steps) <= 0).any():
-        raise ValueError("world_steps must rise from line to line")
-    if not ((success >= 0) & (success <= 1)).all():
+    if not ((curve.success >= 0) & (curve.success <= 1)).all():
         raise ValueError("success must be between 0 and 1")
-    return Curve(steps, success)
+    return curve
 
 
 def band_of(curves: Sequence[Curve], rounds: int) -> Band:
