@@ -44,6 +44,9 @@ Episodes = Annotated[int, Field(ge=1, le=MAX_ROUNDS)]
 MAX_POLICY_BYTES = 1 << 26
 """Largest ``policy.safetensors`` that is read back."""
 
+MAX_CRITIC_BYTES = 1 << 29
+MAX_LAYERS = 8
+
 METHOD_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 """It names a folder and a row of the tables."""
 
@@ -106,7 +109,7 @@ class AlgorithmConfig(Section):
 
     name: str
     critic: Literal["per_agent", "shared"]
-    net_arch: Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(max_length=8)]
+    net_arch: Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(max_length=MAX_LAYERS)]
     learning_rate: Annotated[float, Field(gt=0, le=1)]
     batch_size: Annotated[int, Field(ge=1, le=1 << 20)]
     gamma: Share
@@ -363,7 +366,7 @@ def _check_algorithm(name: str) -> None:
 
 def _check_networks(config: Config) -> None:
     """Refuse networks so large that the policy could not be read back, or that nobody wants to allocate."""
-    limits = {"actors": MAX_POLICY_BYTES // 2, "critics": 1 << 29}
+    limits = {"actors": MAX_POLICY_BYTES // 2, "critics": MAX_CRITIC_BYTES}
     for role, weights in count_weights(config).items():
         if 4 * weights > limits[role]:
             raise ConfigError(
@@ -378,12 +381,13 @@ def count_weights(config: Config) -> dict[str, int]:
     joint = n * (size + 2)
     shared = a.critic == "shared"
     return {
-        "actors": n * _weights([size, *a.net_arch, 2]),
-        "critics": _weights([joint, *a.net_arch, n]) if shared else n * _weights([joint, *a.net_arch, 1]),
+        "actors": n * weights_between([size, *a.net_arch, 2]),
+        "critics": weights_between([joint, *a.net_arch, n]) if shared else n * weights_between([joint, *a.net_arch, 1]),
     }
 
 
-def _weights(sizes: list[int]) -> int:
+def weights_between(sizes: list[int]) -> int:
+    """Return the number of weights and biases of dense layers between so many values each."""
     return sum((a + 1) * b for a, b in pairwise(sizes))
 
 

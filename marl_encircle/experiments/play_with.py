@@ -5,6 +5,7 @@ another environment deserves.
 """
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -20,7 +21,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from marl_encircle import files
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
 from marl_encircle.experiments.build import load_weights, policy_bytes
-from marl_encircle.experiments.config import MAX_POLICY_BYTES
+from marl_encircle.experiments.config import MAX_CRITIC_BYTES, MAX_LAYERS, MAX_POLICY_BYTES, weights_between
 from marl_encircle.experiments.divergence import Diverged, fault
 from marl_encircle.experiments.metrics import Interval, student_interval
 from marl_encircle.experiments.progress import ProgressBar
@@ -209,6 +210,7 @@ def load_played(folder: str | Path) -> MADDPGPolicy:
     try:
         about = json.loads(files.read_bytes(path, max_bytes=1 << 20))
         low, high = (np.array(about[key], np.float32) for key in ("action_low", "action_high"))
+        _check_size(len(about["agents"]), math.prod(about["observation_shape"]), about["net_arch"], low.size)
         policy = MADDPGPolicy(
             spaces.Box(-np.inf, np.inf, tuple(about["observation_shape"])),
             spaces.Box(low, high),
@@ -230,3 +232,10 @@ def load_played(folder: str | Path) -> MADDPGPolicy:
     policy.agents = tuple(about["agents"])
     policy.set_training_mode(False)
     return policy
+
+
+def _check_size(n: int, size: int, net_arch: list[int], act: int) -> None:
+    """Raise a ValueError for networks that are larger than any that could have been saved."""
+    actors, critic = n * weights_between([size, *net_arch, act]), weights_between([n * (size + act), n])
+    if len(net_arch) > MAX_LAYERS or 4 * actors > MAX_POLICY_BYTES or 4 * critic > MAX_CRITIC_BYTES:
+        raise ValueError(f"its networks would have {actors + critic} weights in {len(net_arch)} layers")

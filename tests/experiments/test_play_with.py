@@ -127,6 +127,26 @@ def test_a_damaged_policy_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("net_arch", [4000, 4000]),
+        ("net_arch", [1] * 9),
+        ("observation_shape", [10**13]),
+        ("observation_shape", [10**5, 10**5]),
+        ("agents", ["a"] * 20_000),
+    ],
+)
+def test_networks_that_nobody_can_have_saved_are_refused_before_they_are_built(
+    result: Played, tmp_path: Path, key: str, value: Any
+) -> None:
+    save_policy(tmp_path, result, {})
+    about = json.loads((tmp_path / "policy.json").read_text())
+    files.write_json(tmp_path / "policy.json", {**about, key: value})
+    with pytest.raises(files.DamagedFileError, match=r"policy\.json: .* its networks would have \d+ weights"):
+        load_played(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("key", "value"), [("net_arch", [8]), ("observation_shape", [2]), ("agents", ["one"]), ("action_high", [2.0, 2.0])]
 )
 def test_a_description_of_another_policy_is_refused(result: Played, tmp_path: Path, key: str, value: Any) -> None:
