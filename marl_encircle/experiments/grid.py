@@ -108,6 +108,11 @@ def _config(job: Job) -> Config:
     )
 
 
+def read_anew() -> None:
+    """Forget the configurations of all jobs: the files that they came from may have changed."""
+    _config.cache_clear()
+
+
 class Grid(NamedTuple):
     """The runs of a grid and what is made of them.
 
@@ -135,7 +140,7 @@ def load_grid(name: str) -> Grid:
     :param name: a name in ``configs/paper/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
     """
-    _config.cache_clear()
+    read_anew()
     path = find_file(name, "grid")
     try:
         grid = GridConfig(**read_yaml(path))

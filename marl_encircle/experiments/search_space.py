@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from marl_encircle.experiments.config import Config, Profile, Section
 from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
+from marl_encircle.experiments.grid import Job, SettingConfig, naming_file, read_anew
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Setting
 from marl_encircle.experiments.trainable import check_seed, check_training, memory_needed
@@ -190,6 +190,7 @@ def load_space(name: str | Path) -> Space:
     :param name: a name in ``configs/tuning/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; every value that may be tried is checked too
     """
+    read_anew()
     path = find_file(str(name), "tuning")
     values = read_yaml(path)
     for key in ("scenario", "reward", "algorithm"):

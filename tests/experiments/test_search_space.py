@@ -49,6 +49,13 @@ def test_dimensions_have_the_names_of_the_keys_that_they_move(tmp_path: Path) ->
     }
 
 
+def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
+    path = search_file(tmp_path, algorithm="mine.yaml")
+    for tau in (0.02, 0.03):
+        (tmp_path / "mine.yaml").write_text(f"base: maddpg\ntau: {tau}\n")
+        assert load_space(path).to_dict()["config"]["algorithm"]["tau"] == tau
+
+
 def test_keys_that_a_record_leaves_out_are_tried_first_with_their_defaults(tmp_path: Path) -> None:
     search = "{algorithm: {n_steps: {low: 1, high: 5}, features: {choices: [relative, observation]}}}"
     base = load_space(search_file(tmp_path, search=search)).base
