@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError
 
 from marl_encircle.experiments.config import Profile, Section
 from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import Job, SettingConfig, naming_file
+from marl_encircle.experiments.grid import Job, SettingConfig, naming_file, read_anew
 from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.trainable import check_seed
@@ -52,6 +52,7 @@ def load_protocol(name: str) -> Protocol:
     :param name: a name in ``configs/paper/`` or the path of a YAML file
     :raises ConfigError: naming file and key
     """
+    read_anew()
     path = find_file(name, "protocol")
     protocol = _read(path)
     scenarios = 1 + len(protocol.neighbours) + protocol.combinations

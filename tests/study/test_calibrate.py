@@ -16,7 +16,7 @@ from marl_encircle.experiments.trainable import memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import calibrate as calibration
 from marl_encircle.study.calibrate import Trial, calibrate, render
-from marl_encircle.study.protocol import MAX_SCENARIOS, Protocol, Result, load_protocol, name_of, paper_cells
+from marl_encircle.study.protocol import MAX_SCENARIOS, Protocol, Result, jobs_of, load_protocol, name_of, paper_cells
 
 ROOT = Path(__file__).parents[2]
 PROTOCOL = """\
@@ -52,6 +52,15 @@ def with_distances(monkeypatch: pytest.MonkeyPatch, distances: Mapping[str, floa
     monkeypatch.setattr(calibration, "sweep", lambda jobs, *_: Progress(total=len(jobs), done=len(jobs)))
     monkeypatch.setattr(calibration, "_measure", measure)
     return asked
+
+
+def test_a_scenario_whose_file_changed_is_read_again(tmp_path: Path) -> None:
+    scenario = tmp_path / "mine.yaml"
+    (tmp_path / "protocol.yaml").write_text(PROTOCOL.replace("centre", str(scenario)))
+    for acceleration in (4.0, 5.0):
+        scenario.write_text(f"base: centre\nacceleration: {acceleration}\n")
+        protocol = load_protocol(str(tmp_path / "protocol.yaml"))
+        assert jobs_of(protocol, {})[0].config.scenario.acceleration == acceleration
 
 
 @pytest.mark.parametrize(
