@@ -41,6 +41,10 @@ TINY = (
     "scenario.acceleration=5.0",
     "scenario.turn_order=pursuers_first",
 )
+IN_SEVERAL_SETTINGS = (
+    "algorithm.features=set",
+    "training.settings=[{speed_ratio: 1.05, pursuers: 2, obstacles: 1}, {speed_ratio: 1.1, pursuers: 3, obstacles: 0}]",
+)
 FILES = ("policy.safetensors", "progress.csv", "episodes.csv")
 
 

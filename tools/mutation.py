@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / ".cache" / "mutation" / "results.jsonl"
 LEAST_SCORE = 0.85
 
-EXPERIMENTS = ("config", "faults", "overrides", "trainable", "yaml_files")
+EXPERIMENTS = ("config", "faults", "overrides", "sections", "sizes", "trainable", "yaml_files")
 MODULES = (
     *(f"core/{path.name}" for path in sorted((ROOT / "marl_encircle" / "core").glob("[a-z]*.py"))),
     *(f"maddpg/{path.name}" for path in sorted((ROOT / "marl_encircle" / "maddpg").glob("[a-z]*.py"))),
@@ -50,6 +50,8 @@ TESTS = {
     "experiments/config.py": ("experiments/test_config.py", "experiments/test_features.py"),
     "experiments/faults.py": ("experiments/test_faults.py", "experiments/test_config.py"),
     "experiments/overrides.py": ("experiments/test_config.py",),
+    "experiments/sections.py": ("experiments/test_config.py", "experiments/test_refusals.py"),
+    "experiments/sizes.py": ("experiments/test_config.py", "experiments/test_features.py"),
     "experiments/yaml_files.py": ("experiments/test_yaml_files.py", "experiments/test_config.py"),
 }
 """Where other files than ``tests/<folder>/test_<name>.py`` are those that should notice."""

@@ -8,18 +8,13 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.experiments.config import (
-    AlgorithmConfig,
-    EvaluationConfig,
-    RewardConfig,
-    TrainingConfig,
-    load_config,
-)
+from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import GridConfig, load_grid
 from marl_encircle.experiments.library import Kind, files_of, find_file, is_path, load_section
 from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.search_space import SearchFile, load_space
+from marl_encircle.experiments.sections import AlgorithmConfig, EvaluationConfig, RewardConfig, TrainingConfig
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.spelling import nearest
 from marl_encircle.study.protocol import Protocol, load_protocol

@@ -6,15 +6,16 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty, world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.envs.slot_vec_env import SlotVecEnv
 
 
-class EncirclementVecEnv(VecEnv):
+class EncirclementVecEnv(SlotVecEnv):
     """B worlds of N pursuers as B * N environment slots, world by world: slot = world * N + pursuer.
 
     Every slot has its own scalar reward. All slots of a world end together: terminated when the encirclement is
@@ -116,28 +117,6 @@ class EncirclementVecEnv(VecEnv):
                     }
             self._arena.restart(worlds, observations)
         return self._slots(observations), rewards.ravel(), np.repeat(done, self.n_agents), infos
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to give back."""
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of this VecEnv once for each slot asked for."""
-        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of this VecEnv; all slots share it."""
-        setattr(self, attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Call a method of this VecEnv, once, and return its result for each slot asked for."""
-        result = getattr(self, method_name)(*method_args, **method_kwargs)
-        return [result for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each slot: worlds are no Gymnasium environments that could be wrapped."""
-        return [False for _ in self._get_indices(indices)]
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next steps depend on, for an exact resume."""

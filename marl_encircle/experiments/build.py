@@ -2,6 +2,7 @@
 
 import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -16,19 +17,14 @@ from marl_encircle.core.observations import bounds
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
+from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
-from marl_encircle.experiments.config import (
-    MAX_POLICY_BYTES,
-    AlgorithmConfig,
-    Config,
-    Profile,
-    Schedule,
-    load_config,
-)
-from marl_encircle.experiments.features import RelativeFeatures
+from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, Profile, load_config
+from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
 from marl_encircle.experiments.pretrained import find_run, is_run_path, pretrained_runs, setting_of
 from marl_encircle.experiments.records import read_record
+from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
@@ -90,12 +86,15 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
 
     :raises ConfigError: for an unknown engine, or a curriculum that starts where the scene is not allowed
     """
-    check_engine(engine)
+    check_engine(engine, config)
     if curriculum:
         check_curriculum(config)
     scenario, reward = config.scenario, config.reward.build()
     worlds: VecEnv
-    if engine == "native":
+    if config.training.settings:
+        scenarios = [replace(scenario, **setting._asdict()) for setting in config.settings]
+        worlds = MixedVecEnv(scenario, scenarios, reward, n_worlds)
+    elif engine == "native":
         worlds = EncirclementVecEnv(scenario, reward, n_worlds)
     else:
         worlds = SuperSuitVecEnv(lambda: encirclement_v0.parallel_env(scenario, reward), n_worlds)
@@ -107,10 +106,12 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
     return VecMonitor(CurriculumVecEnv(worlds, levels))
 
 
-def check_engine(engine: str) -> None:
-    """Raise a ConfigError, naming the nearest, unless there is such an engine."""
+def check_engine(engine: str, config: Config) -> None:
+    """Raise a ConfigError unless there is such an engine, and it can train what the configuration asks for."""
     if engine not in get_args(Engine):
         raise ConfigError(f"engine {engine!r:.80}: unknown engine{nearest(str(engine), get_args(Engine))}")
+    if config.training.settings and engine != "native":
+        raise ConfigError(f"training.settings: only the native engine trains in several; got {engine}")
 
 
 def _check_integer(name: str, value: object, least: int) -> None:
@@ -158,10 +159,10 @@ def features_kwargs(config: Config) -> dict[str, Any]:
     """Return the policy's arguments that say what its networks read."""
     if config.algorithm.features == "observation":
         return {}
-    return {
-        "features_extractor_class": RelativeFeatures,
-        "features_extractor_kwargs": {"scenario": config.scenario},
-    }
+    kwargs: dict[str, Any] = {"features_extractor_kwargs": {"scenario": config.scenario}}
+    if config.algorithm.features == "relative":
+        return {"features_extractor_class": RelativeFeatures, **kwargs}
+    return {"features_extractor_class": SetFeatures, "share_parameters": True, **kwargs}
 
 
 class NoiseSchedule:
@@ -195,6 +196,18 @@ def build_policy(config: Config) -> MADDPGPolicy:
     )
     policy.agents = config.scenario.agents
     return policy
+
+
+def fit_policy(policy: MADDPGPolicy, config: Config, scenario: Scenario) -> MADDPGPolicy:
+    """Return a policy for other numbers of bodies, with the same weights: one whose features are sets.
+
+    :param config: of the policy
+    :param scenario: to play in
+    """
+    fitted = build_policy(config.model_copy(update={"scenario": scenario}))
+    fitted.actor.load_state_dict(policy.actor.state_dict())
+    fitted.set_training_mode(False)
+    return fitted
 
 
 def policy_bytes(policy: MADDPGPolicy) -> bytes:

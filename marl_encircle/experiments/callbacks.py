@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -141,7 +142,10 @@ class LearningCurve(BaseCallback):
     def add_point(self) -> None:
         """Evaluate the present policy and write the curve so far."""
         e = self.config.evaluation
-        episodes = play_rounds(self.model.policy, self.config, e.curve_episodes, e.curve_seed)
+        settings = self.config.settings
+        n_rounds = -(-e.curve_episodes // len(settings))
+        played = (play_rounds(self.model.policy, self.config, n_rounds, e.curve_seed, each) for each in settings)
+        episodes = [episode._replace(round=i) for i, episode in enumerate(chain.from_iterable(played))]
         own = summarise_run(episodes, self.config.reward.closure)
         rates = [summarise_run(episodes, rule).success for rule in ("all", "pursuers")]
         row = [self.curriculum.world_steps, own.success, own.mean_episode_length, *rates, own.sigma_c]

@@ -7,174 +7,34 @@ A configuration has five sections, each read from the file that :mod:`marl_encir
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-)
+from pydantic import ConfigDict, ValidationError
 
-from marl_encircle.core.geometry import Closure
-from marl_encircle.core.observations import layout
-from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
 from marl_encircle.experiments.faults import explain, naming_files
 from marl_encircle.experiments.overrides import parse_overrides
-from marl_encircle.experiments.records import MAX_ROUNDS, Cell, Setting
+from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.sections import (
+    METHOD_NAME,
+    AlgorithmConfig,
+    EvaluationConfig,
+    RewardConfig,
+    Section,
+    TrainingConfig,
+)
+from marl_encircle.experiments.sizes import count_weights
 from marl_encircle.experiments.yaml_files import ConfigError, merge
 from marl_encircle.spelling import nearest
 
 Profile = Literal["full", "smoke"]
-Features = Literal["observation", "relative"]
-Count = Annotated[int, Field(ge=1, le=10**10)]
-Share = Annotated[float, Field(ge=0, le=1)]
-Episodes = Annotated[int, Field(ge=1, le=MAX_ROUNDS)]
 
 MAX_POLICY_BYTES = 1 << 26
 """Largest ``policy.safetensors`` that is read back."""
 
 MAX_CRITIC_BYTES = 1 << 29
-MAX_LAYERS = 8
-
-METHOD_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
-"""It names a folder and a row of the tables."""
-
-
-def _even(value: int) -> int:
-    if value % 2:
-        raise ValueError("must be even")
-    return value
-
-
-def _off_as_empty(value: Any) -> Any:
-    return {} if value is None else value
-
-
-def _as_floats(value: Any) -> Any:
-    """1 and 1.0 are one weight, and one hash."""
-    if isinstance(value, dict):
-        return {key: _as_floats(inner) for key, inner in value.items()}
-    if isinstance(value, int) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError as error:
-            raise ValueError("number too large for a float") from error
-    return value
-
-
-class Section(BaseModel):
-    """What all sections have in common: unknown keys and silent conversions are errors."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-class RewardConfig(Section):
-    """A method: see :class:`marl_encircle.core.rewards.Reward`; ``name`` is the row of the tables."""
-
-    name: Annotated[str, Field(pattern=METHOD_NAME)]
-    closure: Closure = "all"
-    two_stage: bool = True
-    scale: float = 0.05
-    terms: Annotated[dict[str, Any], AfterValidator(_as_floats)]
-
-    def build(self) -> Reward:
-        """Return the reward."""
-        return Reward(self.terms, self.closure, self.two_stage, self.scale)
-
-
-class Schedule(Section):
-    """A straight line from ``start`` to ``end`` over ``world_steps``, then ``end``."""
-
-    start: Annotated[float, Field(ge=0, le=10)]
-    end: Annotated[float, Field(ge=0, le=10)]
-    world_steps: Count
-
-
-class AlgorithmConfig(Section):
-    """One of ``ALGORITHMS``. ``*_world_steps`` count steps of all pursuers of one world, ``train_freq`` vec steps.
-
-    A key with a default came after the first runs; one that has it is left out, so that their hashes stay.
-    """
-
-    name: str
-    critic: Literal["per_agent", "shared"]
-    net_arch: Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(max_length=MAX_LAYERS)]
-    learning_rate: Annotated[float, Field(gt=0, le=1)]
-    batch_size: Annotated[int, Field(ge=1, le=1 << 20)]
-    gamma: Share
-    tau: Annotated[float, Field(gt=0, le=1)]
-    policy_delay: Count
-    actor_regularization: Annotated[float, Field(ge=0)]
-    max_grad_norm: Annotated[float, Field(gt=0)] | None
-    buffer_world_steps: Count
-    random_world_steps: Annotated[int, Field(ge=0)]
-    train_freq: Count
-    gradient_steps: Count
-    exploration_noise: Schedule
-    exploration_random: Share
-    learning_rate_end: Annotated[float, Field(gt=0, le=1)] | None = None
-    n_steps: Annotated[int, Field(ge=1, le=1000)] = 1
-    features: Features = "observation"
-
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        defaults = self.defaults()
-        return {key: value for key, value in handler(self).items() if key not in defaults or value != defaults[key]}
-
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        """Return the values of the keys that have one by default."""
-        return {name: field.default for name, field in cls.model_fields.items() if not field.is_required()}
-
-
-class Ramp(Section):
-    """A scenario field that moves in a straight line from ``start`` to its final value over ``world_steps``."""
-
-    start: float
-    world_steps: Count
-
-
-Curriculum = Annotated[
-    dict[Literal["safety_distance", "obstacle_radius", "speed_ratio"], Ramp | None], BeforeValidator(_off_as_empty)
-]
-"""null switches all of it off."""
-
-
-class TrainingConfig(Section):
-    """How long, in how many worlds, by which curriculum."""
-
-    n_worlds: Annotated[int, Field(ge=1, le=1 << 16)]
-    world_steps: Count
-    curve_every: Count
-    curriculum: Curriculum
-
-
-class EvaluationConfig(Section):
-    """Which rounds are played at the end of a training and for its learning curve."""
-
-    episodes: Episodes
-    seed: Annotated[int, Field(ge=0, lt=1 << 63)]
-    curve_episodes: Episodes
-    curve_seed: Annotated[int, Field(ge=0, lt=1 << 63)]
-    n_directions: Annotated[int, Field(ge=8, le=4096), AfterValidator(_even)]
-
-    @field_validator("curve_seed")
-    @classmethod
-    def _other_rounds(cls, curve_seed: int, info: ValidationInfo) -> int:
-        if curve_seed == info.data.get("seed"):
-            raise ValueError("must differ from evaluation.seed, whose rounds are reported")
-        return curve_seed
 
 
 class Config(Section):
@@ -196,7 +56,9 @@ class Config(Section):
     def with_defaults(self) -> dict[str, Any]:
         """Return what :meth:`to_dict` does, with the keys that it leaves out."""
         values = self.to_dict()
-        return {**values, "algorithm": {**values["algorithm"], **(self.algorithm.defaults() | values["algorithm"])}}
+        for name, section in ("algorithm", self.algorithm), ("training", self.training):
+            values[name] = {**values[name], **(section.defaults() | values[name])}
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
@@ -214,6 +76,11 @@ class Config(Section):
         """Method and setting: which cell of the tables a run belongs to."""
         s = self.scenario
         return Cell(self.reward.name, Setting(s.speed_ratio, s.pursuers, s.obstacles, s.scene))
+
+    @property
+    def settings(self) -> list[Setting]:
+        """The settings that are trained in, as many worlds in each."""
+        return [Setting(**setting.model_dump()) for setting in self.training.settings] or [self.cell.setting]
 
 
 def load_config(
@@ -305,6 +172,7 @@ def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
     if not reward.active:
         raise ConfigError("reward.terms: all are off; at least one needs a weight")
     _check_networks(config)
+    _check_settings(config)
     _check_algorithm(config.algorithm.name)
     return config
 
@@ -364,43 +232,41 @@ def _check_algorithm(name: str) -> None:
         raise ConfigError(f"algorithm.name: unknown algorithm{nearest(name, ALGORITHMS)}; got {name!r:.80}")
 
 
+def _check_settings(config: Config) -> None:
+    """Refuse settings that the networks cannot read, or that one more pursuer than the scenario has would be in."""
+    where, settings = "training.settings", config.training.settings
+    if not settings:
+        return
+    if config.algorithm.features != "set":
+        raise ConfigError(f"{where}: needs algorithm.features set; got {config.algorithm.features}")
+    if config.training.n_worlds % len(settings):
+        raise ConfigError(
+            f"training.n_worlds: must be a multiple of the {len(settings)} settings; got {config.training.n_worlds}"
+        )
+    for i, setting in enumerate(settings):
+        try:
+            dataclasses.replace(config.scenario, **setting.model_dump())
+        except ValueError as error:
+            raise ConfigError(f"{where}.{i}: {error}") from error
+        for name in ("speed_ratio", "pursuers", "obstacles"):
+            value, most = getattr(setting, name), getattr(config.scenario, name)
+            if value > most:
+                raise ConfigError(f"{where}.{i}.{name}: must be at most scenario.{name}, {most}; got {value}")
+        if setting.scene != config.scenario.scene:
+            raise ConfigError(
+                f"{where}.{i}.scene: must be scenario.scene, {config.scenario.scene}; got {setting.scene!r:.80}"
+            )
+
+
 def _check_networks(config: Config) -> None:
     """Refuse networks so large that the policy could not be read back, or that nobody wants to allocate."""
     limits = {"actors": MAX_POLICY_BYTES // 2, "critics": MAX_CRITIC_BYTES}
-    for role, weights in count_weights(config).items():
+    for role, weights in count_weights(config.scenario, config.algorithm).items():
         if 4 * weights > limits[role]:
             raise ConfigError(
                 f"algorithm.net_arch: the {role} would have {4 * weights / 1e6:.0f} MB of weights; "
                 f"at most {limits[role] / 1e6:.0f} MB"
             )
-
-
-def count_weights(config: Config) -> dict[str, int]:
-    """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
-    a, n, size = config.algorithm, config.scenario.pursuers, features_size(config.scenario, config.algorithm.features)
-    joint = n * (size + 2)
-    shared = a.critic == "shared"
-    return {
-        "actors": n * weights_between([size, *a.net_arch, 2]),
-        "critics": weights_between([joint, *a.net_arch, n]) if shared else n * weights_between([joint, *a.net_arch, 1]),
-    }
-
-
-def weights_between(sizes: list[int]) -> int:
-    """Return the number of weights and biases of dense layers between so many values each."""
-    return sum((a + 1) * b for a, b in pairwise(sizes))
-
-
-def observation_size(config: Config) -> int:
-    """Return the number of values that a pursuer observes."""
-    return features_size(config.scenario, "observation")
-
-
-def features_size(scenario: Scenario, features: Features) -> int:
-    """Return the number of values that the networks read of a pursuer's observation."""
-    size = list(layout(scenario).values())[-1].stop
-    others = scenario.pursuers - 1 + scenario.units
-    return int(size + (4 * others if features == "relative" else 0))
 
 
 def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:

@@ -10,6 +10,7 @@ from marl_encircle.core.rounds import NEVER
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.experiments.build import fit_policy
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.records import Episode, Setting
 from marl_encircle.maddpg.policies import MADDPGPolicy
@@ -28,10 +29,13 @@ def play_rounds(
 
     :param episodes: number of rounds
     :param seed: evaluation seed; world r is seeded with ``world_seeds(seed, episodes)[r]``
-    :param setting: where to play; by default where the policy was trained
+    :param setting: where to play; by default where the policy was trained. Other numbers of bodies need the features
+        ``set``
     """
     fields = {} if setting is None else setting._asdict()
     scenario = replace(config.scenario, **fields, n_directions=config.evaluation.n_directions)
+    if (scenario.pursuers, scenario.units) != (config.scenario.pursuers, config.scenario.units):
+        policy = fit_policy(policy, config, scenario)
     reward = config.reward.build()
     rounds: list[Episode] = []
     seeds = world_seeds(seed, -(-episodes // WORLDS_AT_ONCE) * WORLDS_AT_ONCE)

@@ -1,12 +1,15 @@
 """What the networks read in place of the bare observation."""
 
+from itertools import pairwise
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 
 from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.experiments.config import features_size
+from marl_encircle.experiments.sizes import BODY_SIZE, SET_SIZE, features_size
 
 
 class RelativeFeatures(BaseFeaturesExtractor):
@@ -36,12 +39,64 @@ class RelativeFeatures(BaseFeaturesExtractor):
         for name in self.parts.keys() & {"obstacles", "obstacle_directions"}:
             parts[name] = _in_order(_pairs(parts[name]), nearest_first).flatten(1)
         seen_from_target = others, _in_order(obstacles, nearest_first)
-        seen = [part.flatten(1) for offsets in seen_from_target for part in (offsets, self._direction(offsets))]
+        directions = [_direction(offsets, self.softening) for offsets in seen_from_target]
+        seen = [part.flatten(1) for both in zip(seen_from_target, directions, strict=True) for part in both]
         return th.cat([*parts.values(), *seen], dim=1)
 
-    def _direction(self, offsets: th.Tensor) -> th.Tensor:
-        distance: th.Tensor = offsets.norm(dim=2, keepdim=True)
-        return offsets / (distance + self.softening)
+
+class SetFeatures(BaseFeaturesExtractor):
+    """The other pursuers and the obstacles as sets: weights for any number of them, in whichever order.
+
+    A small network reads each body: its offset and direction as seen from the pursuer and from the target, with the
+    target's from the pursuer and the pursuer's velocity. Of what it makes of the bodies of a kind, the actors and the
+    critics read the greatest and the mean of each value, beside what the observation says of the pursuer, the target
+    and the extras. A body whose offset is zero is not there, as ``MixedVecEnv`` has it.
+
+    :param observation_space: of a pursuer
+    :param scenario: whose observations these are
+    """
+
+    def __init__(self, observation_space: spaces.Space[object], scenario: Scenario) -> None:
+        super().__init__(observation_space, features_size(scenario, "set"))
+        self.parts = layout(scenario)
+        self.softening = scenario.direction_softening
+        self.embed = nn.ModuleDict(
+            {kind: _perceptron(BODY_SIZE, SET_SIZE, SET_SIZE) for kind in ("pursuers", "obstacles")}
+        )
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Return the features, shape (B, features).
+
+        :param observations: shape (B, O)
+        """
+        parts = {name: observations[:, part] for name, part in self.parts.items()}
+        velocity, target = parts["velocity"][:, None], parts["target"][:, None]
+        own = [part for name, part in parts.items() if not name.startswith(("pursuer", "obstacle"))]
+        pooled = []
+        for kind, embed in self.embed.items():
+            offsets = _pairs(parts[kind])
+            if not offsets.shape[1]:
+                pooled += [observations.new_zeros(len(observations), SET_SIZE)] * 2
+                continue
+            seen = offsets, offsets - target, target.expand_as(offsets)
+            directions = [_direction(each, self.softening) for each in seen]
+            values = embed(th.cat([*seen, *directions, velocity.expand_as(offsets)], dim=2))
+            there = (offsets != 0).any(dim=2, keepdim=True)
+            values = values * there
+            pooled += [values.amax(1), values.sum(1) / there.sum(1).clamp(min=1)]
+        return th.cat([*own, *pooled], dim=1)
+
+
+def _perceptron(*sizes: int) -> nn.Sequential:
+    """Return layers of these sizes, each with a ReLU after it, so that zero is the least that they give."""
+    layers = [(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(sizes)]
+    return nn.Sequential(*(module for layer in layers for module in layer))
+
+
+def _direction(offsets: th.Tensor, softening: float) -> th.Tensor:
+    """Return r / (norm(r) + softening) of each offset r, (B, K, 2)."""
+    distance: th.Tensor = offsets.norm(dim=2, keepdim=True)
+    return offsets / (distance + softening)
 
 
 def _pairs(part: th.Tensor) -> th.Tensor:

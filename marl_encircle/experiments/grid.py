@@ -11,34 +11,22 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, ValidationError
 
 from marl_encircle.core.scenes import SCENES
-from marl_encircle.experiments.config import (
-    Config,
-    Profile,
-    Section,
-    difference,
-    load_config,
-)
+from marl_encircle.experiments.config import Config, Profile, difference, load_config
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.sections import Section, SettingConfig
 from marl_encircle.experiments.trainable import check_seed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.spelling import nearest
-
-
-class SettingConfig(Section):
-    """One column of a table."""
-
-    speed_ratio: float
-    pursuers: int
-    obstacles: int
-    scene: str = "random"
 
 
 class Group(Section):
     """Every method in every setting with every seed.
 
     :param overrides: changes of their configurations, ``section.key=value`` each
+    :param elsewhere: other settings in which the policies are played too, in any number of bodies if their features
+        are sets
     """
 
     methods: Annotated[list[str], Field(min_length=1)]
@@ -46,6 +34,7 @@ class Group(Section):
     overrides: Annotated[list[str], Field(default_factory=list)]
     settings: Annotated[list[SettingConfig], Field(min_length=1)]
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=1 << 32)]], Field(min_length=1)]
+    elsewhere: Annotated[list[SettingConfig], Field(default_factory=list)]
 
 
 class Shared(Section):
@@ -151,6 +140,7 @@ def load_grid(name: str) -> Grid:
         return str(path.parent / name) if is_path(name) else name
 
     jobs: dict[Job, None] = {}
+    asked: dict[Setting, tuple[Setting, ...]] = {}
     owners: dict[Cell, Job] = {}
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
@@ -174,12 +164,14 @@ def load_grid(name: str) -> Grid:
                 with naming_file(path):
                     _check_same(earlier, first)
                 jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
+                if group.elsewhere:
+                    asked[setting] = tuple(Setting(**other.model_dump()) for other in group.elsewhere)
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
     in_order = tuple(sorted(jobs, key=lambda job: job.seed))
     with naming_file(path):
-        elsewhere = _elsewhere(in_order, grid.elsewhere)
+        elsewhere = _elsewhere(in_order, grid.elsewhere, asked)
     return Grid(in_order, aliases, grid.frozen, elsewhere)
 
 
@@ -209,14 +201,20 @@ def _check_same(earlier: Job, later: Job) -> None:
         )
 
 
-def _elsewhere(jobs: Iterable[Job], entries: Iterable[Elsewhere]) -> dict[Setting, tuple[Setting, ...]]:
+def _elsewhere(
+    jobs: Iterable[Job], entries: Iterable[Elsewhere], asked: Mapping[Setting, tuple[Setting, ...]]
+) -> dict[Setting, tuple[Setting, ...]]:
     """Return the settings in which the policies of each setting are played too.
 
-    :raises ConfigError: for a scene that there is not, or whose obstacles the policies cannot observe
+    :param asked: those that groups ask for, by the setting of their training
+    :raises ConfigError: for a scene that there is not, or bodies that the policies cannot observe
     """
     jobs = list(jobs)
     trained = {job.setting for job in jobs}
-    played: dict[Setting, tuple[Setting, ...]] = {}
+    played = dict(asked)
+    for job in jobs:
+        for other in asked.get(job.setting, ()):
+            _check_playable(job, other)
     for i, entry in enumerate(entries):
         if entry.scene not in SCENES:
             raise ConfigError(f"elsewhere.{i}.scene: unknown scene {entry.scene!r:.80}{nearest(entry.scene, SCENES)}")
@@ -229,6 +227,21 @@ def _elsewhere(jobs: Iterable[Job], entries: Iterable[Elsewhere]) -> dict[Settin
                 raise ConfigError(f"elsewhere.{i}.scene: needs composite_unit, or an obstacle there is several here")
             played[job.setting] = (*played.get(job.setting, ()), other)
     return played
+
+
+def _check_playable(job: Job, other: Setting) -> None:
+    """Refuse a setting whose scenario is not allowed, or has other bodies than a job's networks can read."""
+    config = job.config
+    try:
+        scenario = replace(config.scenario, **other._asdict())
+    except ValueError as error:
+        raise ConfigError(f"elsewhere: {error}") from error
+    same = (scenario.pursuers, scenario.units) == (config.scenario.pursuers, config.scenario.units)
+    if not same and config.algorithm.features != "set":
+        raise ConfigError(
+            f"elsewhere: policies of {job.reward} cannot play with other numbers of bodies than they were trained "
+            "with; that needs algorithm.features set"
+        )
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

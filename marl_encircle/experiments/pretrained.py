@@ -12,9 +12,10 @@ from pydantic import ValidationError
 
 from marl_encircle.core.scenes import SCENES
 from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import SettingConfig, load_grid
+from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.library import PACKAGE, reward_names
 from marl_encircle.experiments.records import Cell, Setting, read_record, read_setting, run_path
+from marl_encircle.experiments.sections import SettingConfig
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.spelling import nearest
 

@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from marl_encircle.experiments.config import Config, Profile, Section
+from marl_encircle.experiments.config import Config, Profile
 from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import Job, SettingConfig, naming_file, read_anew
+from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.sections import Section, SettingConfig
 from marl_encircle.experiments.trainable import check_seed, check_training, memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 

@@ -93,7 +93,7 @@ def train(
     :raises Stopped: after SIGINT or SIGTERM, with a checkpoint written
     """
     check_seed(config, seed)
-    check_engine(engine)
+    check_engine(engine, config)
     folder = run_folder(config, seed, out)
     if ended_run(folder, config, seed, engine) is not None:
         return folder, False

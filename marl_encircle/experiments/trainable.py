@@ -4,7 +4,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from marl_encircle.experiments.config import Config, build_scenario, count_weights, fields_of, observation_size
+from marl_encircle.experiments.config import Config, build_scenario, fields_of
+from marl_encircle.experiments.sizes import count_weights, observation_size
 from marl_encircle.experiments.yaml_files import ConfigError
 
 CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -90,7 +91,8 @@ def check_memory(needed: Mapping[str, int], available: int) -> None:
 
 def memory_needed(config: Config) -> dict[str, int]:
     """Return the least memory [bytes] that a training takes, by the key that asks for it."""
-    a, n, size = config.algorithm, config.scenario.pursuers, observation_size(config)
+    a, scenario = config.algorithm, config.scenario
+    n, size = scenario.pursuers, observation_size(scenario)
     steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
     transition = 4 * n * (2 * size + 5)  # two observations, two actions, reward, done, time limit in single precision
     joint = 4 * n * n * (size + 2)  # each critic's input
@@ -98,14 +100,15 @@ def memory_needed(config: Config) -> dict[str, int]:
     return {
         "algorithm.buffer_world_steps": 2 * steps * transition,  # beside that of the checkpoint it resumes from
         "algorithm.batch_size": a.batch_size * (transition + joint + hidden),
-        "algorithm.net_arch": 20 * sum(count_weights(config).values()),  # with targets, gradients, Adam's two moments
+        "algorithm.net_arch": 20 * sum(count_weights(scenario, a).values()),  # with targets, gradients, two moments
         "training.n_worlds": worlds_memory(config, config.training.n_worlds),
     }
 
 
 def worlds_memory(config: Config, n_worlds: int) -> int:
     """Return the least memory [bytes] that worlds take: what each direction meets, twice, under both closure rules."""
-    return n_worlds * (36 * config.scenario.n_directions + 8 * config.scenario.pursuers * observation_size(config))
+    scenario = config.scenario
+    return n_worlds * (36 * scenario.n_directions + 8 * scenario.pursuers * observation_size(scenario))
 
 
 def available_memory() -> int:

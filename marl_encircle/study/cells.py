@@ -6,7 +6,7 @@ from typing import NamedTuple
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments import metrics
-from marl_encircle.experiments.records import Cell, Episode, Run, Status
+from marl_encircle.experiments.records import Cell, Episode, Run, Setting, Status
 
 OTHER_STATUSES: tuple[Status, ...] = ("diverged", "unfinished", "not evaluated")
 
@@ -80,6 +80,18 @@ def gather(runs: Iterable[Run], aliases: Mapping[Cell, Cell]) -> dict[Cell, Cell
         cells[run.cell] = entry._replace(closure=run.closure or entry.closure)
     shared = {cell: owner for cell, owner in aliases.items() if cell not in cells and owner in cells}
     return cells | {cell: cells[owner]._replace(runs_of=owner.method) for cell, owner in shared.items()}
+
+
+def with_settings_elsewhere(runs: Iterable[Run]) -> list[Run]:
+    """Return runs, and what their policies played in other settings of the same scene as runs of those settings."""
+    runs = list(runs)
+    elsewhere = [(run, setting) for run in runs for setting in run.elsewhere]
+    return runs + [run_elsewhere(run, other) for run, other in elsewhere if other.scene == run.cell.setting.scene]
+
+
+def run_elsewhere(run: Run, setting: Setting) -> Run:
+    """Return the rounds that a run's policy played in another setting as those of a run of that setting."""
+    return Run(Cell(run.cell.method, setting), run.seed, run.status, run.closure, run.elsewhere[setting])
 
 
 def result_of(cell: Cell, runs: CellRuns | None, closure: Closure | None = None) -> Result:

@@ -14,6 +14,7 @@ LABELS = {
     "model_c": "Model C",
     "ours": "Ours",
     "ours_plus": "Ours+",
+    "generalist": "Ours+, one policy",
 }
 TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
 """Methods of Tables 2-4 in the paper's order; others follow by name."""

@@ -7,11 +7,12 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from marl_encircle.experiments.config import Profile, Section
+from marl_encircle.experiments.config import Profile
 from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import Job, SettingConfig, naming_file, read_anew
+from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.sections import Section, SettingConfig
 from marl_encircle.experiments.trainable import check_seed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.study.paper import reported_cells

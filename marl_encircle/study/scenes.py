@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 
 from marl_encircle.experiments.records import Cell, Run, Setting
-from marl_encircle.study.cells import gather, result_of
+from marl_encircle.study.cells import gather, result_of, run_elsewhere
 from marl_encircle.study.paper import label, rank
 from marl_encircle.study.paper_layout import notes_on, success_and_length
 from marl_encircle.study.tables import frozen_note, record_of
@@ -29,9 +29,13 @@ def render_scenes(
     """
     played: list[Run] = []
     for run in runs:
-        others = [other for other in elsewhere.get(run.cell.setting, ()) if other in run.elsewhere]
+        others = [
+            other
+            for other in elsewhere.get(run.cell.setting, ())
+            if other in run.elsewhere and other.scene != run.cell.setting.scene
+        ]
         if others:
-            played += [run, *(_as_run(run, other) for other in others)]
+            played += [run, *(run_elsewhere(run, other) for other in others)]
     if not played:
         return {}
     results = {cell: result_of(cell, found) for cell, found in gather(played, {}).items()}
@@ -48,8 +52,3 @@ def render_scenes(
         to_csv([record_of(result, None) for result in results.values()]),
     )
     return dict(zip(SCENE_TABLES, texts, strict=True))
-
-
-def _as_run(run: Run, setting: Setting) -> Run:
-    """Return the rounds that a run's policy played in another setting as those of a run of that setting."""
-    return Run(Cell(run.cell.method, setting), run.seed, run.status, run.closure, run.elsewhere[setting])

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from marl_encircle.experiments.records import Cell, Run
-from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of
+from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of, with_settings_elsewhere
 from marl_encircle.study.differences import difference_table, render_differences
 from marl_encircle.study.paper import PaperResult, label, paper_results, rank, reported_cells
 from marl_encircle.study.paper_layout import LAYOUTS, notes_on, seeds_of, success_and_length, wide
@@ -68,14 +68,15 @@ def render_tables(
 ) -> dict[str, str]:
     """Tables 2-4, the same results under the common closure rule, the paired differences, and other settings' results.
 
-    :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart
+    :param runs: all runs to show; seeds of one cell are averaged, so give tuning and study seeds apart. A policy that
+        has played in other settings of its scene is shown in these too
     :param aliases: cell -> the cell whose runs it shares when it has none of its own
     :param asked: cells that are shown in the paper's settings even if they have no runs
     :param frozen: commit in which scenario and recipe were frozen, for a note
     :return: file name -> text
     :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
     """
-    by_cell = gather(runs, aliases or {})
+    by_cell = gather(with_settings_elsewhere(runs), aliases or {})
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))
@@ -122,7 +123,7 @@ def main_tables(
 
     What is in them is what :func:`render_tables` writes, whose parameters these are.
     """
-    by_cell = gather(runs, aliases)
+    by_cell = gather(with_settings_elsewhere(runs), aliases)
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))

@@ -32,8 +32,9 @@ from marl_encircle.experiments.build import (
     make_vec_env,
     policy_bytes,
 )
-from marl_encircle.experiments.config import Schedule, load_config
+from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.records import config_hash
+from marl_encircle.experiments.sections import Schedule
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG, MATD3
 

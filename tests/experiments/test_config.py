@@ -15,9 +15,10 @@ from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
 from marl_encircle.experiments import config as configuration
-from marl_encircle.experiments.config import Config, count_weights, difference, load_config, observation_size
+from marl_encircle.experiments.config import Config, difference, load_config
 from marl_encircle.experiments.library import reward_names
 from marl_encircle.experiments.records import config_hash
+from marl_encircle.experiments.sizes import count_weights, observation_size
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.experiments.trainable import check_training
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -359,16 +360,16 @@ def test_networks_that_could_not_be_read_back_are_refused(overrides: Sequence[st
 def test_the_weights_that_are_counted_are_those_of_the_networks(critic: Any) -> None:
     overrides = [f"algorithm.critic={critic}", "algorithm.net_arch=[8, 6]"]
     config = load_config(fields={"pursuers": 4}, overrides=overrides)
-    spaces = Box(-1, 1, (observation_size(config),)), Box(-1, 1, (2,))
+    spaces = Box(-1, 1, (observation_size(config.scenario),)), Box(-1, 1, (2,))
     policy = maddpg.MADDPGPolicy(*spaces, lambda _: 1e-3, 4, critic=critic, net_arch=[8, 6])
     networks = {"actors": policy.actor, "critics": policy.critic}
-    assert count_weights(config) == {
+    assert count_weights(config.scenario, config.algorithm) == {
         role: sum(parameter.numel() for parameter in network.parameters()) for role, network in networks.items()
     }
 
 
 def test_a_policy_may_fill_half_of_what_is_read_back_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    size = 4 * count_weights(load_config())["actors"]
+    size = 4 * count_weights(load_config().scenario, load_config().algorithm)["actors"]
     monkeypatch.setattr(configuration, "MAX_POLICY_BYTES", 2 * size)
     load_config()
     monkeypatch.setattr(configuration, "MAX_POLICY_BYTES", 2 * size - 2)

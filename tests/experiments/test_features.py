@@ -1,4 +1,4 @@
-"""What the networks read: every body as the target sees it, obstacles in an order of their own."""
+"""What the networks read: bodies as the target sees them, in an order of their own or as sets."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,12 +10,11 @@ import torch as th
 from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs.encirclement_v0 import parallel_env
-from marl_encircle.experiments.build import build_model, build_policy, build_vec_env
-from marl_encircle.experiments.config import count_weights, load_config
-from marl_encircle.experiments.features import RelativeFeatures
+from marl_encircle.experiments.build import build_model, build_policy, build_vec_env, fit_policy
+from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
+from marl_encircle.experiments.sizes import count_weights
 from marl_encircle.maddpg.gradients import is_plain
-
-RELATIVE = ("algorithm.features=relative",)
 
 
 def observed(scenario: Scenario) -> tuple[th.Tensor, Any]:
@@ -25,9 +24,12 @@ def observed(scenario: Scenario) -> tuple[th.Tensor, Any]:
     return th.from_numpy(np.stack(list(observations.values()))), env
 
 
-def features_of(scenario: Scenario, observations: th.Tensor) -> th.Tensor:
+def features_of(
+    scenario: Scenario, observations: th.Tensor, kind: type[RelativeFeatures | SetFeatures] = RelativeFeatures
+) -> th.Tensor:
     env = parallel_env(scenario)
-    extractor = RelativeFeatures(env.observation_space("pursuer_0"), scenario)
+    th.manual_seed(0)
+    extractor = kind(env.observation_space("pursuer_0"), scenario)
     features: th.Tensor = extractor(observations)
     assert features.shape[1] == extractor.features_dim
     return features
@@ -54,7 +56,8 @@ def test_bodies_are_seen_from_the_target_the_nearest_obstacle_first() -> None:
         assert th.equal(features[:, parts[name]], observations[:, parts[name]])
 
 
-def test_the_order_of_the_obstacles_means_nothing() -> None:
+@pytest.mark.parametrize("kind", [RelativeFeatures, SetFeatures])
+def test_the_order_of_the_obstacles_means_nothing(kind: type[RelativeFeatures | SetFeatures]) -> None:
     scenario = Scenario(obstacles=3)
     observations, _ = observed(scenario)
     others = observations.clone()
@@ -62,7 +65,41 @@ def test_the_order_of_the_obstacles_means_nothing() -> None:
         part = layout(scenario)[name]
         others[:, part] = observations[:, part].reshape(-1, 3, 2)[:, [2, 0, 1]].flatten(1)
     assert not th.equal(others, observations)
-    assert th.equal(features_of(scenario, others), features_of(scenario, observations))
+    assert th.allclose(features_of(scenario, others, kind), features_of(scenario, observations, kind), atol=1e-6)
+
+
+def test_the_order_of_the_other_pursuers_means_nothing_to_sets() -> None:
+    scenario = Scenario(pursuers=4)
+    observations, _ = observed(scenario)
+    others = observations.clone()
+    for name in ("pursuers", "pursuer_directions"):
+        part = layout(scenario)[name]
+        others[:, part] = observations[:, part].reshape(-1, 3, 2)[:, [2, 0, 1]].flatten(1)
+    features = features_of(scenario, observations, SetFeatures)
+    assert th.allclose(features_of(scenario, others, SetFeatures), features, atol=1e-6)
+    assert not th.allclose(features[0], features[1]), "they do say where the others are"
+
+
+def test_a_set_says_where_each_body_is() -> None:
+    scenario = Scenario(pursuers=4, obstacles=2)
+    observations, _ = observed(scenario)
+    features = features_of(scenario, observations, SetFeatures)
+    for name in ("pursuers", "obstacles", "target", "velocity"):
+        moved = observations.clone()
+        moved[:, layout(scenario)[name].start] += 0.1
+        assert not th.allclose(features_of(scenario, moved, SetFeatures), features, atol=1e-4), name
+
+
+def test_a_body_that_is_not_there_changes_nothing() -> None:
+    """As ``MixedVecEnv`` pads: zeros in the place of a fourth pursuer and of two obstacles."""
+    scenario, largest = Scenario(obstacles=0), Scenario(pursuers=4, obstacles=2)
+    observations, _ = observed(scenario)
+    padded = th.zeros(len(observations), largest.pursuers * 4 + 8 + 4)
+    for name, part in layout(scenario).items():
+        start = layout(largest)[name].start
+        padded[:, start : start + part.stop - part.start] = observations[:, part]
+    features = features_of(scenario, observations, SetFeatures)
+    assert th.allclose(features_of(largest, padded, SetFeatures), features, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -72,17 +109,34 @@ def test_the_order_of_the_obstacles_means_nothing() -> None:
 )
 def test_any_setting_has_features(fields: dict[str, Any]) -> None:
     scenario = replace(Scenario(), **fields)
-    assert features_of(scenario, observed(scenario)[0]).isfinite().all()
+    for kind in (RelativeFeatures, SetFeatures):
+        assert features_of(scenario, observed(scenario)[0], kind).isfinite().all()
 
 
-def test_a_configuration_that_asks_for_them_trains_and_plays_with_them() -> None:
-    config = load_config(algorithm="matd3", profile="smoke", fields={"obstacles": 2}, overrides=RELATIVE)
+@pytest.mark.parametrize("features", ["relative", "set"])
+def test_a_configuration_that_asks_for_them_trains_and_plays_with_them(features: str) -> None:
+    overrides = (f"algorithm.features={features}", "algorithm.random_world_steps=20")
+    config = load_config(algorithm="matd3", profile="smoke", fields={"obstacles": 2}, overrides=overrides)
     model = build_model(config, build_vec_env(config, 2), 0)
+    before = model.policy.actor_state_dict()
+    before = {name: weights.clone() for name, weights in before.items()}
     model.learn(600)
-    assert is_plain(model.actor)
-    assert is_plain(model.critic)
+    assert not any(th.equal(weights, before[name]) for name, weights in model.policy.actor_state_dict().items())
+    assert [is_plain(model.actor), is_plain(model.critic)] == [features == "relative"] * 2, "sets are learnt"
     policy = build_policy(config)
     policy.actor.load_state_dict(model.actor.state_dict())
     observations = np.random.default_rng(0).uniform(-1, 1, (6, *model.observation_space.shape)).astype(np.float32)
     np.testing.assert_array_equal(policy.predict(observations)[0], model.predict(observations)[0])
-    assert count_weights(config)["actors"] == sum(weights.numel() for weights in model.actor.parameters())
+    counted = count_weights(config.scenario, config.algorithm)["actors"]
+    assert counted == sum(weights.numel() for weights in model.actor.parameters())
+
+
+def test_weights_of_sets_serve_any_number_of_bodies() -> None:
+    config = load_config(fields={"obstacles": 2}, overrides=("algorithm.features=set",))
+    policy = build_policy(config)
+    for fields in ({"pursuers": 2, "obstacles": 0}, {"pursuers": 7, "obstacles": 5}):
+        scenario = replace(config.scenario, **fields)
+        observations, _ = observed(scenario)
+        actions, _ = fit_policy(policy, config, scenario).predict(observations.numpy())
+        assert actions.shape == (scenario.pursuers, 2)
+        assert len(np.unique(actions, axis=0)) == scenario.pursuers

@@ -109,6 +109,27 @@ def test_a_scene_in_which_no_policy_can_play_is_refused(tmp_path: Path) -> None:
         grid_of(tmp_path, "scenario: split.yaml\n" + text + "elsewhere: [{scene: tunnel, obstacles: 1}]\n")
 
 
+SETS = """\
+profile: smoke
+groups:
+  - methods: [ours]
+    overrides: [algorithm.features=%s]
+    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]
+    seeds: [0]
+    elsewhere: [{speed_ratio: 1.2, pursuers: 7, obstacles: %s}]
+shared: []
+"""
+
+
+def test_policies_of_sets_are_played_with_other_bodies(tmp_path: Path) -> None:
+    assert grid_of(tmp_path, SETS % ("set", 5)).elsewhere == {ONE: (Setting(1.2, 7, 5),)}
+    for features in ("observation", "relative"):
+        with pytest.raises(ConfigError, match="elsewhere: policies of ours cannot play with other numbers of bodies"):
+            grid_of(tmp_path, SETS % (features, 5))
+    with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere: obstacles must be"):
+        grid_of(tmp_path, SETS % ("set", -1))
+
+
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
     grid = load_grid("all")
     assert len(grid.cells) == 44

@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common import logger
 from tiny_runs import (
     FILES,
+    IN_SEVERAL_SETTINGS,
     TINY,
     contents,
     copy_of_finished,
@@ -160,6 +161,7 @@ def test_bodies_that_cannot_be_placed_are_told_before_anything_is_written(
         ([], 2000, "native", r"seed must differ from evaluation\.curve_seed"),
         ([], -1, "native", "seed must be an integer"),
         ([], 0, "nativ", "did you mean native?"),
+        (IN_SEVERAL_SETTINGS, 0, "supersuit", r"training\.settings: only the native engine trains in several"),
         (["algorithm.random_world_steps=400"], 0, "native", "or nothing is learnt"),
         (["training.world_steps=10000000000", "algorithm.buffer_world_steps=10000000000"], 0, "native", "GB of memory"),
     ],
@@ -273,18 +275,19 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("engine", "algorithm", "vec_step"),
+    ("engine", "changes", "vec_step"),
     # before the first step; among random actions; before and after the buffer is full; in the midst of rounds
     [
-        *(("native", "maddpg", step) for step in (0, 7, 33, 71)),
-        *(("native", algorithm, 50) for algorithm in ("matd3", "matd3_relative")),
-        ("supersuit", "maddpg", 50),
+        *(("native", {}, step) for step in (0, 7, 33, 71)),
+        *(("native", {"algorithm": algorithm}, 50) for algorithm in ("matd3", "matd3_relative")),
+        ("native", {"overrides": IN_SEVERAL_SETTINGS}, 50),
+        ("supersuit", {}, 50),
     ],
 )
 def test_a_stopped_training_goes_on_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine, algorithm: str, vec_step: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine, changes: dict[str, Any], vec_step: int
 ) -> None:
-    config = tiny(algorithm=algorithm)
+    config = tiny(**changes)
     ends = keep_the_end(monkeypatch)
     whole, _ = train.train(config, 0, engine, tmp_path / "whole")
     with monkeypatch.context() as patch:

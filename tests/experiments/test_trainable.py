@@ -10,9 +10,10 @@ from tiny_runs import tiny
 from marl_encircle.experiments import trainable
 from marl_encircle.experiments.build import build_model, build_vec_env
 from marl_encircle.experiments.checkpoint import REPLAY
-from marl_encircle.experiments.config import load_config, observation_size
+from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.sizes import observation_size
 from marl_encircle.experiments.sweep import sweep
 from marl_encircle.experiments.trainable import (
     available_memory,
@@ -101,7 +102,7 @@ def test_the_memory_that_is_needed_is_that_of_the_arrays() -> None:
         fields={"pursuers": 3, "obstacles": 1, "n_directions": 72},
         overrides=["algorithm.buffer_world_steps=1000", "algorithm.batch_size=10", "training.n_worlds=5"],
     )
-    size = observation_size(config)
+    size = observation_size(config.scenario)
     assert memory_needed(config) == {
         "algorithm.buffer_world_steps": 2 * 1000 * 3 * (2 * size + 5) * 4,
         # a transition, what the three critics see of it (3 x 3 x (size + 2)), two hidden layers of 64 of three pursuers

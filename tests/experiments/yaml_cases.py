@@ -6,6 +6,13 @@ LONG = "x" * 5000
 DIGITS = "9" * 3000
 HEXADECIMAL = "0x" + "f" * 5000  # reading it costs nothing, but Python does not write it out as digits
 
+
+def settings(ratio: float, pursuers: int, obstacles: int, scene: str = "random", times: int = 1) -> list[str]:
+    """Overrides that train in one setting, given so many times."""
+    setting = f"{{speed_ratio: {ratio}, pursuers: {pursuers}, obstacles: {obstacles}, scene: {scene}}}"
+    return ["algorithm.features=set", f"training.settings=[{', '.join([setting] * times)}]"]
+
+
 REWARD_FILES: list[tuple[str | bytes, str]] = [
     # no mapping
     ("", "must be a mapping of keys to values; got None"),
@@ -139,6 +146,9 @@ OVERRIDES: list[tuple[str, str]] = [
     ("algorithm.exploration_noise.ends=0.1", "algorithm.exploration_noise.ends: unknown key; did you mean end?"),
     ("algorithm.exploration_random=2", "algorithm.exploration_random: input should be less than or equal to 1"),
     # training and evaluation
+    ("training.settings=[{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]", "settings: needs algorithm.features set"),
+    ("training.settings=[{pursuers: 3}]", "training.settings.0.speed_ratio: missing"),
+    ("training.settings=3", "training.settings: input should be a valid list; got 3"),
     ("training.n_worlds=0", "training.n_worlds: input should be greater than or equal to 1; got 0"),
     ("training.n_worlds=65537", "training.n_worlds: input should be less than or equal to 65536"),
     ("training.world_steps=20_000.5", "training.world_steps: input should be a valid integer"),
@@ -191,6 +201,13 @@ ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"overrides": ["reward.name=" + "x" * 128_001]}, "larger than 128 kB"),
     ({"overrides": None}, "overrides must be a list of section.key=value; got None"),
     ({"overrides": [3]}, "overrides must be a list of section.key=value; one is 3"),
+    ({"overrides": settings(1.1, 4, 1)}, "training.settings.0.pursuers: must be at most scenario.pursuers, 3; got 4"),
+    ({"overrides": settings(1.1, 3, 2)}, "training.settings.0.obstacles: must be at most scenario.obstacles, 1; got 2"),
+    ({"overrides": settings(1.2, 3, 1)}, "training.settings.0.speed_ratio: must be at most scenario.speed_ratio, 1.1"),
+    ({"overrides": settings(0.9, 3, 1)}, "training.settings.0: speed_ratio must be between 1 and 100; got 0.9"),
+    ({"overrides": settings(1.1, 3, 1, "tunnel")}, "training.settings.0.scene: must be scenario.scene, random; got"),
+    ({"overrides": [*settings(1.1, 3, 1), "training.n_worlds=0"]}, "training.n_worlds: input should be greater"),
+    ({"overrides": settings(1.1, 3, 1, times=3)}, "training.n_worlds: must be a multiple of the 3 settings; got 64"),
     ({"fields": {"pursuers": float("nan")}}, "scenario.pursuers must be an integer; got nan"),
     ({"fields": {"speed_ratio": float("inf")}}, "scenario.speed_ratio must be between 1 and 100; got inf"),
     ({"fields": {"obstacle": 1}}, "scenario.obstacle: unknown key; did you mean obstacles?"),

@@ -1,11 +1,12 @@
 """The whole road for a grid: what is missing is trained and evaluated, once, and the tables follow."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_runs import TINY, everything_in, train_in_this_process
+from tiny_runs import IN_SEVERAL_SETTINGS, TINY, everything_in, train_in_this_process
 
 from marl_encircle import files
 from marl_encircle.experiments import grid as grids
@@ -83,6 +84,24 @@ def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) ->
     assert counts(reproduce("smoke", tmp_path, 1)) == (1, 0, 1)
     assert (first / "episodes.csv").read_bytes() == rounds
     assert tables(tmp_path) == before
+
+
+def test_one_policy_fills_the_cells_of_several_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def tiny(*arguments: Any, **named: Any) -> Config:
+        return load_config(*arguments, **{**named, "overrides": (*TINY, *IN_SEVERAL_SETTINGS)})
+
+    monkeypatch.setattr(grids, "load_config", tiny)
+    grid = tmp_path / "grid.yaml"
+    others = "elsewhere: [{speed_ratio: 1.1, pursuers: 2, obstacles: 1}, {speed_ratio: 1.1, pursuers: 5, obstacles: 1}]"
+    grid.write_text(ELSEWHERE.partition("elsewhere")[0].replace("seeds: [0]", f"seeds: [0]\n    {others}"))
+    assert counts(reproduce(str(grid), tmp_path, 1)) == (1, 0, 0)
+    [run] = read_runs(tmp_path / "runs")
+    assert list(run.elsewhere) == [Setting(1.1, 2, 1), Setting(1.1, 5, 1)]
+    with (tmp_path / "tables" / "table3.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["method"] == "ours" and row["result"] == "run"]
+    assert [row["pursuers"] for row in rows] == ["2", "3", "5"]
+    assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
+    assert verify(load_grid(str(grid)), tmp_path).rounds == 3 * len(run.episodes)
 
 
 def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:

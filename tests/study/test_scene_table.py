@@ -39,6 +39,13 @@ def test_methods_stand_in_the_papers_order_and_a_scene_not_played_is_empty() -> 
     assert rows[1][4:] == ["90.0 / 20.0", "80.0 / 30.0", ""]
 
 
+def test_another_setting_of_the_same_scene_is_no_other_scene() -> None:
+    two = ONE._replace(pursuers=2)
+    home = finished("ours", ONE, 0, 90)
+    run = Run(home.cell, 0, "finished", home.closure, home.episodes, {two: rounds(10, 100, step=30)})
+    assert render_scenes([run], {ONE: (two,)}) == {}
+
+
 def test_runs_that_stayed_at_home_have_no_place_in_it() -> None:
     assert render_scenes([finished("ours", ONE, 0, 90)], ELSEWHERE) == {}
     assert render_scenes([played("ours", 0, 90, tunnel=80)], {}) == {}

@@ -277,6 +277,19 @@ def test_a_method_that_the_paper_lacks_gets_its_row_after_the_papers() -> None:
     assert r"my\_method &" in rendered["table4.tex"]
 
 
+def test_a_policy_is_shown_in_every_setting_that_it_has_played() -> None:
+    home, many = Setting(1.4, 5, 3), Setting(1.1, 7, 1)
+    played = {ONE: rounds(80, 100, step=30), OPEN: rounds(70, 100, step=20), many: rounds(60, 100, step=20)}
+    run = finished("one_for_all", home, 0, 90)
+    run = Run(run.cell, 0, "finished", run.closure, run.episodes, played)
+    rendered = tables.render_tables([run])
+    assert markdown_row(rendered["table4.md"], "one_for_all") == ["70.0 / 20.0", "80.0 / 30.0", "not run", "not run"]
+    settings = [row[:5] for row in markdown_rows(rendered["table_other.md"])]
+    assert settings == [["one_for_all", "1.1", "7", "1", "random"], ["one_for_all", "1.4", "5", "3", "random"]]
+    tunnel = Run(run.cell, 0, "finished", run.closure, run.episodes, {ONE._replace(scene="tunnel"): run.episodes})
+    assert "tunnel" not in "".join(tables.render_tables([tunnel]).values())
+
+
 def test_cells_outside_the_papers_settings_have_a_table_of_their_own() -> None:
     tunnel, five, many = Setting(1.1, 3, 1, "tunnel"), Setting(1.1, 5, 2), Setting(1.25, 3, 0)
     runs = [

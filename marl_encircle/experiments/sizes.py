@@ -1,0 +1,45 @@
+"""How many numbers an observation, the features made of it and the networks have."""
+
+from itertools import pairwise
+
+from marl_encircle.core.observations import layout
+from marl_encircle.core.scenario import Scenario
+from marl_encircle.experiments.sections import AlgorithmConfig, Features
+
+SET_SIZE = 32
+"""Of what the features ``set`` make of each body."""
+
+BODY_SIZE = 14
+"""Of what they read of it."""
+
+
+def count_weights(scenario: Scenario, algorithm: AlgorithmConfig) -> dict[str, int]:
+    """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
+    n, hidden, sets = scenario.pursuers, algorithm.net_arch, algorithm.features == "set"
+    size = features_size(scenario, algorithm.features)
+    actor, joint = weights_between([size, *hidden, 2]), n * (size + 2)
+    bodies = 2 * weights_between([BODY_SIZE, SET_SIZE, SET_SIZE]) if sets else 0
+    if algorithm.critic == "shared":
+        critics = weights_between([joint, *hidden, n])
+    else:
+        critics = n * weights_between([joint, *hidden, 1])
+    return {"actors": (1 if sets else n) * actor + bodies, "critics": critics + bodies}
+
+
+def weights_between(sizes: list[int]) -> int:
+    """Return the number of weights and biases of dense layers between so many values each."""
+    return sum((a + 1) * b for a, b in pairwise(sizes))
+
+
+def observation_size(scenario: Scenario) -> int:
+    """Return the number of values that a pursuer observes."""
+    return int(list(layout(scenario).values())[-1].stop)
+
+
+def features_size(scenario: Scenario, features: Features) -> int:
+    """Return the number of values that the networks read of a pursuer's observation."""
+    size = observation_size(scenario)
+    others = scenario.pursuers - 1 + scenario.units
+    if features == "set":
+        return int(size - (4 if scenario.observe_directions else 2) * others + 4 * SET_SIZE)
+    return int(size + (4 * others if features == "relative" else 0))
