@@ -187,7 +187,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
         ("train --engine n", ["native"]),
         ("watch o", ["ours", "ours_plus"]),
         ("watch --versus o", ["ours", "ours_plus"]),
-        ("sweep ", ["all", "beyond", "committed", "smoke"]),
+        ("sweep ", ["all", "committed", "smoke"]),
         ("tables --grid s", ["smoke"]),
         ("calibrate ", ["calibration"]),
         ("tune ", ["default"]),
