@@ -1,8 +1,7 @@
 """Configuration -> objects: the environment that trains, the model, and a trained policy read back."""
 
 import zipfile
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,7 +21,7 @@ from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, Profile, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
-from marl_encircle.experiments.pretrained import find_run, is_run_path, pretrained_runs, setting_of
+from marl_encircle.experiments.pretrained import find_run, in_words, is_run_path, pretrained_runs, setting_of
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
 from marl_encircle.experiments.trainable import check_curriculum
@@ -92,7 +91,7 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
     scenario, reward = config.scenario, config.reward.build()
     worlds: VecEnv
     if config.training.settings:
-        scenarios = [replace(scenario, **setting._asdict()) for setting in config.settings]
+        scenarios = [config.in_setting(setting).scenario for setting in config.settings]
         worlds = MixedVecEnv(scenario, scenarios, reward, n_worlds)
     elif engine == "native":
         worlds = EncirclementVecEnv(scenario, reward, n_worlds)
@@ -198,13 +197,12 @@ def build_policy(config: Config) -> MADDPGPolicy:
     return policy
 
 
-def fit_policy(policy: MADDPGPolicy, config: Config, scenario: Scenario) -> MADDPGPolicy:
-    """Return a policy for other numbers of bodies, with the same weights: one whose features are sets.
+def fit_policy(policy: MADDPGPolicy, config: Config) -> MADDPGPolicy:
+    """Return a policy whose features are sets, with the same weights, for other numbers of bodies.
 
-    :param config: of the policy
-    :param scenario: to play in
+    :param config: the policy's, in the setting to play in
     """
-    fitted = build_policy(config.model_copy(update={"scenario": scenario}))
+    fitted = build_policy(config)
     fitted.actor.load_state_dict(policy.actor.state_dict())
     fitted.set_training_mode(False)
     return fitted
@@ -228,8 +226,10 @@ def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MA
     :raises ConfigError: for a name or a setting without a policy, with those that there are and the nearest
     :raises DamagedFileError: if a file is missing, changed, does not fit the configuration, or is not trusted
     """
+    wanted: dict[str, Any] = {}
     if isinstance(what, str) and not is_run_path(what):
-        what = find_run(what, setting_of(fields), [pretrained_runs()])
+        setting = setting_of(fields)
+        what, wanted = find_run(what, setting, [pretrained_runs()]), setting._asdict()
     elif fields:
         raise ConfigError(f"{what}: has a setting of its own; {', '.join(fields)} can only be given with a name")
     path = Path(what)
@@ -238,14 +238,16 @@ def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MA
             return load_actors(path)
         except Exception as error:  # unpickling raises whatever it likes
             raise files.DamagedFileError(path, f"holds no actors: {_one_line(error)}") from error
-    policy, _, _ = load_run(path)
+    policy, _, _ = load_run(path, wanted)
     return policy
 
 
-def load_run(run: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
+def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
     """Return a run's policy, configuration and record; see :func:`load_policy`.
 
     :param run: its folder, or the ``policy.safetensors`` in it
+    :param fields: of a setting to play in, as far as they are not the run's; only policies of sets have others
+    :raises ConfigError: for a setting that the policy does not serve
     :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
     """
     folder = Path(run)
@@ -263,6 +265,13 @@ def load_run(run: str | Path) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
         reason = f"does not hold this policy's weights: {_one_line(error)}"
         raise files.DamagedFileError(folder / POLICY, reason) from error
     policy.set_training_mode(False)
+    trained = config.cell.setting
+    setting = trained._replace(**(fields or {}))
+    if setting != trained:
+        if config.algorithm.features != "set":
+            raise ConfigError(f"{folder} was trained {in_words(trained)}; asked for {in_words(setting)}")
+        config = config.in_setting(setting)
+        policy = fit_policy(policy, config)
     return policy, config, record
 
 

@@ -77,6 +77,14 @@ class Config(Section):
         s = self.scenario
         return Cell(self.reward.name, Setting(s.speed_ratio, s.pursuers, s.obstacles, s.scene))
 
+    def in_setting(self, setting: Setting) -> "Config":
+        """Return the configuration in another setting.
+
+        :raises ConfigError: if the scenario does not allow it
+        """
+        scenario = build_scenario({**fields_of(self.scenario), **setting._asdict()})
+        return self.model_copy(update={"scenario": scenario})
+
     @property
     def settings(self) -> list[Setting]:
         """The settings that are trained in, as many worlds in each."""
@@ -245,8 +253,8 @@ def _check_settings(config: Config) -> None:
         )
     for i, setting in enumerate(settings):
         try:
-            dataclasses.replace(config.scenario, **setting.model_dump())
-        except ValueError as error:
+            config.in_setting(config.settings[i])
+        except ConfigError as error:
             raise ConfigError(f"{where}.{i}: {error}") from error
         for name in ("speed_ratio", "pursuers", "obstacles"):
             value, most = getattr(setting, name), getattr(config.scenario, name)

@@ -32,10 +32,11 @@ def play_rounds(
     :param setting: where to play; by default where the policy was trained. Other numbers of bodies need the features
         ``set``
     """
-    fields = {} if setting is None else setting._asdict()
-    scenario = replace(config.scenario, **fields, n_directions=config.evaluation.n_directions)
-    if (scenario.pursuers, scenario.units) != (config.scenario.pursuers, config.scenario.units):
-        policy = fit_policy(policy, config, scenario)
+    if setting not in (None, config.cell.setting):
+        trained, config = config.scenario, config.in_setting(setting)
+        if (trained.pursuers, trained.units) != (config.scenario.pursuers, config.scenario.units):
+            policy = fit_policy(policy, config)
+    scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
     reward = config.reward.build()
     rounds: list[Episode] = []
     seeds = world_seeds(seed, -(-episodes // WORLDS_AT_ONCE) * WORLDS_AT_ONCE)

@@ -233,10 +233,10 @@ def _check_playable(job: Job, other: Setting) -> None:
     """Refuse a setting whose scenario is not allowed, or has other bodies than a job's networks can read."""
     config = job.config
     try:
-        scenario = replace(config.scenario, **other._asdict())
-    except ValueError as error:
+        there, here = config.in_setting(other).scenario, config.scenario
+    except ConfigError as error:
         raise ConfigError(f"elsewhere: {error}") from error
-    same = (scenario.pursuers, scenario.units) == (config.scenario.pursuers, config.scenario.units)
+    same = (there.pursuers, there.units) == (here.pursuers, here.units)
     if not same and config.algorithm.features != "set":
         raise ConfigError(
             f"elsewhere: policies of {job.reward} cannot play with other numbers of bodies than they were trained "

@@ -50,7 +50,7 @@ def setting_of(fields: Mapping[str, Any]) -> Setting:
 
 
 def find_run(method: str, setting: Setting, folders: Sequence[Path]) -> Path:
-    """Return the run of a method's first training seed in a setting.
+    """Return the run of a method's first training seed in a setting, else one whose policy serves any setting.
 
     :param folders: of runs, the one to prefer first
     :raises ConfigError: naming what there is, the nearest, and the command that trains it; or that it diverged
@@ -61,6 +61,9 @@ def find_run(method: str, setting: Setting, folders: Sequence[Path]) -> Path:
     methods = {path.name for folder in folders for path in folder.glob("[!.]*") if path.is_dir()}
     if method not in {*methods, *reward_names()}:
         raise ConfigError(f"{method!r:.80}: no method and no run folder{nearest(method, methods)}")
+    found = _run_of_sets(method, folders)
+    if found is not None:
+        return found
     there = {path.parents[1] for folder in folders for path in (folder / method).glob("*/seed*/run.json")}
     known = "it has none at all"
     if there:
@@ -93,6 +96,17 @@ def first_run(cell: Cell, folders: Sequence[Path]) -> Path | None:
                     "stands for no policy; give the folder of a run"
                 )
             return found
+    return None
+
+
+def _run_of_sets(method: str, folders: Sequence[Path]) -> Path | None:
+    """Return a method's first run whose policy serves any setting, since it reads sets; None without one."""
+    for folder in folders:
+        for path in sorted({path.parents[1] for path in (folder / method).glob("*/seed*/run.json")}):
+            first = _first_seed(folder, Cell(method, read_setting(path)))
+            algorithm = read_record(first)["config"].get("algorithm") if first else None
+            if isinstance(algorithm, dict) and algorithm.get("features") == "set":
+                return first
     return None
 
 

@@ -1,7 +1,7 @@
 """What there is to watch: which policy, which rounds, and what a drawing shows of each moment. Numbers only."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from marl_encircle.experiments.pretrained import (
     pretrained_runs,
     setting_of,
 )
-from marl_encircle.experiments.records import Cell
+from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.replay import Replay, record_round
@@ -68,9 +68,8 @@ def find_match(
     side = find_side(what, results, fields, scene, policy)
     if versus is None:
         return Match(side, eval_seed=eval_seed)
-    ratio, pursuers, obstacles, scene = side.config.cell.setting
-    fields = {"speed_ratio": ratio, "pursuers": pursuers, "obstacles": obstacles}
-    other = find_side(versus, results, fields, scene, policy if _is_yaml(versus) else None)
+    setting = side.config.cell.setting
+    other = find_side(versus, results, _numbers(setting), setting.scene, policy if _is_yaml(versus) else None)
     return Match(side, other, eval_seed=eval_seed)
 
 
@@ -108,10 +107,7 @@ def find_side(
     else:  # who was not trained in a scene plays it as trained in the usual one
         trained_in = first_run(Cell(what, wanted), folders)
         folder = trained_in or find_run(what, wanted._replace(scene=USUAL_SETTING.scene), folders)
-    actors, config, record = load_run(folder)
-    has = config.cell.setting
-    if any(getattr(has, name) != value for name, value in (fields or {}).items()):
-        raise ConfigError(f"{folder} was trained {in_words(has)}; asked for {in_words(wanted)}")
+    actors, config, record = load_run(folder, fields if policy or is_folder else _numbers(wanted))
     trained = config.reward.name
     if policy is not None:
         config = config.model_copy(update={"reward": load_config(what).reward})
@@ -119,22 +115,27 @@ def find_side(
     return Side(
         title,
         actors,
-        _in_scene(config, scene or has.scene, folder),
+        _in_scene(config, scene or config.scenario.scene, folder),
         folder,
         record["seed"],
         trained if trained != title else "",
     )
 
 
+def _numbers(setting: Setting) -> dict[str, Any]:
+    """Return a setting but for its scene."""
+    return {name: value for name, value in setting._asdict().items() if name != "scene"}
+
+
 def _in_scene(config: Config, scene: str, folder: Path) -> Config:
     """Return the configuration with another scene, which the run's policy must be able to see."""
     try:
-        scenario = replace(config.scenario, scene=scene)
-    except ValueError as error:
+        there = config.in_setting(config.cell.setting._replace(scene=scene))
+    except ConfigError as error:
         raise ConfigError(f"scene {scene}: {error}") from error
-    if bounds(scenario)[0].shape != bounds(config.scenario)[0].shape:
+    if bounds(there.scenario)[0].shape != bounds(config.scenario)[0].shape:
         raise ConfigError(f"scene {scene}: the policy of {folder} sees another number of obstacles")
-    return config.model_copy(update={"scenario": scenario})
+    return there
 
 
 def _is_yaml(what: str) -> bool:

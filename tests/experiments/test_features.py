@@ -135,8 +135,9 @@ def test_weights_of_sets_serve_any_number_of_bodies() -> None:
     config = load_config(fields={"obstacles": 2}, overrides=("algorithm.features=set",))
     policy = build_policy(config)
     for fields in ({"pursuers": 2, "obstacles": 0}, {"pursuers": 7, "obstacles": 5}):
-        scenario = replace(config.scenario, **fields)
+        in_setting = config.in_setting(config.cell.setting._replace(**fields))
+        scenario = in_setting.scenario
         observations, _ = observed(scenario)
-        actions, _ = fit_policy(policy, config, scenario).predict(observations.numpy())
+        actions, _ = fit_policy(policy, in_setting).predict(observations.numpy())
         assert actions.shape == (scenario.pursuers, 2)
         assert len(np.unique(actions, axis=0)) == scenario.pursuers

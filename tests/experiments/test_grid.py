@@ -125,7 +125,7 @@ def test_policies_of_sets_are_played_with_other_bodies(tmp_path: Path) -> None:
     for features in ("observation", "relative"):
         with pytest.raises(ConfigError, match="elsewhere: policies of ours cannot play with other numbers of bodies"):
             grid_of(tmp_path, SETS % (features, 5))
-    with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere: obstacles must be"):
+    with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere: scenario\.obstacles must be"):
         grid_of(tmp_path, SETS % ("set", -1))
 
 

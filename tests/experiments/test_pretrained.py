@@ -1,17 +1,21 @@
 """Policies found by name: the first training seed, and what there is where there is none."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from made_up import episode, write_run
-from tiny_runs import finished
+from tiny_runs import IN_SEVERAL_SETTINGS, finished, tiny
 
-from marl_encircle.experiments import pretrained
+from marl_encircle.experiments import build, pretrained
 from marl_encircle.experiments.build import load_policy, policy_bytes
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run, first_run, pretrained_runs, setting_of
 from marl_encircle.experiments.records import Cell, Setting, run_path
+from marl_encircle.experiments.sizes import observation_size
+from marl_encircle.experiments.train import train
 from marl_encircle.experiments.yaml_files import ConfigError
 
 OURS = Cell("ours", USUAL_SETTING)
@@ -77,6 +81,20 @@ def test_an_earlier_folder_is_preferred(tmp_path: Path) -> None:
     write_run(far, OURS, 0, (episode(0, 10),))
     assert find_run("ours", USUAL_SETTING, [near, far]).is_relative_to(near)
     assert find_run("ours", USUAL_SETTING, [tmp_path / "none", far]).is_relative_to(far)
+
+
+def test_a_policy_of_sets_stands_for_any_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, _ = train(tiny(overrides=IN_SEVERAL_SETTINGS), 3, out=tmp_path)
+    monkeypatch.setattr(build, "pretrained_runs", lambda: tmp_path)
+    for fields in ({}, {"pursuers": 2, "obstacles": 0}, {"pursuers": 6, "obstacles": 4, "speed_ratio": 1.25}):
+        assert find_run("ours", setting_of(fields), [tmp_path]) == folder
+        policy = load_policy("ours", **fields)
+        scenario = replace(tiny().scenario, **fields)
+        actions, _ = policy.predict(np.zeros((2 * scenario.pursuers, observation_size(scenario)), np.float32))
+        assert actions.shape == (2 * scenario.pursuers, 2)
+        assert policy.agents == scenario.agents
+    with pytest.raises(ConfigError, match=r"scenario\.speed_ratio must be between"):
+        load_policy("ours", speed_ratio=0.5)
 
 
 def test_without_obstacles_model_a_is_ours(installed: Path) -> None:

@@ -204,7 +204,7 @@ ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"overrides": settings(1.1, 4, 1)}, "training.settings.0.pursuers: must be at most scenario.pursuers, 3; got 4"),
     ({"overrides": settings(1.1, 3, 2)}, "training.settings.0.obstacles: must be at most scenario.obstacles, 1; got 2"),
     ({"overrides": settings(1.2, 3, 1)}, "training.settings.0.speed_ratio: must be at most scenario.speed_ratio, 1.1"),
-    ({"overrides": settings(0.9, 3, 1)}, "training.settings.0: speed_ratio must be between 1 and 100; got 0.9"),
+    ({"overrides": settings(0.9, 3, 1)}, "training.settings.0: scenario.speed_ratio must be between 1 and 100"),
     ({"overrides": settings(1.1, 3, 1, "tunnel")}, "training.settings.0.scene: must be scenario.scene, random; got"),
     ({"overrides": [*settings(1.1, 3, 1), "training.n_worlds=0"]}, "training.n_worlds: input should be greater"),
     ({"overrides": settings(1.1, 3, 1, times=3)}, "training.n_worlds: must be a multiple of the 3 settings; got 64"),

@@ -26,6 +26,7 @@ from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.pretrained import find_run
 from marl_encircle.experiments.records import run_path
+from marl_encircle.experiments.train import train
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays import film, player
 from marl_encircle.replays.player import BAR, SPEEDS, Player, timeline
@@ -97,6 +98,23 @@ def test_other_scenes_are_played_by_the_policy_of_the_random_one(results: Path) 
         find_side("ours", results, scene="tunel")
 
 
+def test_a_policy_of_sets_is_watched_in_any_setting(tmp_path: Path) -> None:
+    folder, _ = train(tiny(overrides=["algorithm.features=set"]), 0, out=tmp_path / "runs")
+    assert find_side("ours", tmp_path).config == find_side(str(folder)).config
+    many = {"pursuers": 5, "obstacles": 2}
+    for what in ("ours", str(folder)):
+        [replay] = Match(find_side(what, tmp_path, many), eval_seed=5).replays(0)
+        assert (replay.scenario.pursuers, replay.scenario.obstacles) == (5, 2)
+        assert replay.pursuers.shape[1] == 5
+    copy_of_finished(tmp_path / "other" / "runs")
+    with pytest.raises(ConfigError, match="no run of ours with 5 pursuers"):
+        find_side("ours", tmp_path / "other", many)
+    with pytest.raises(ConfigError, match="was trained with 3 pursuers and 1 obstacle"):
+        find_side(str(finished()), None, many)
+    with pytest.raises(ConfigError, match="pursuers must be"):
+        find_side("ours", tmp_path, {"pursuers": 0})
+
+
 def test_a_reward_is_watched_with_the_policy_of_a_run(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(REWARD)
     with pytest.raises(ConfigError, match="--policy RUN_DIR"):
@@ -138,7 +156,7 @@ def test_a_run_folder_of_another_setting_or_with_a_policy_is_refused() -> None:
     ("fields", "scene", "said"),
     [
         ({"composite_unit": False}, "tunnel", "scene tunnel: the policy of .* sees another number of obstacles"),
-        ({"obstacles": 2, "half_width": 0.4}, "tunnel", "scene tunnel: too many bodies to place"),
+        ({"obstacles": 2, "half_width": 0.4}, "tunnel", "scene tunnel: scenario: too many bodies to place"),
     ],
 )
 def test_a_scene_that_a_policy_cannot_play_in_is_refused(fields: dict[str, Any], scene: str, said: str) -> None:
