@@ -17,7 +17,7 @@ from marl_encircle.core.simulator import Simulator
 from marl_encircle.experiments import config as configuration
 from marl_encircle.experiments.config import Config, difference, load_config
 from marl_encircle.experiments.library import reward_names
-from marl_encircle.experiments.records import config_hash
+from marl_encircle.experiments.records import Setting, config_hash
 from marl_encircle.experiments.sizes import count_weights, observation_size
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.experiments.trainable import check_training
@@ -345,9 +345,9 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "role"),
     [
-        (["algorithm.net_arch=[4096, 4096, 4096]"], "the actors would have"),
+        (["algorithm.net_arch=[4096, 4096, 4096]"], "the actors would have 404 MB of weights; at most 34 MB"),
         (["algorithm.net_arch=[300]", "algorithm.critic=per_agent", "scenario.pursuers=64",
-          "scenario.pursuer_radius=0.01"], "the critics would have"),
+          "scenario.pursuer_radius=0.01"], "the critics would have 1308 MB of weights; at most 537 MB"),
     ],
 )  # fmt: skip
 def test_networks_that_could_not_be_read_back_are_refused(overrides: Sequence[str], role: str) -> None:
@@ -366,6 +366,25 @@ def test_the_weights_that_are_counted_are_those_of_the_networks(critic: Any) -> 
     assert count_weights(config.scenario, config.algorithm) == {
         role: sum(parameter.numel() for parameter in network.parameters()) for role, network in networks.items()
     }
+
+
+def test_with_defaults_a_configuration_has_the_keys_that_it_leaves_out() -> None:
+    config = load_config(overrides=["algorithm.n_steps=3"])
+    left_out, shown = config.to_dict(), config.with_defaults()
+    assert {"features", "learning_rate_end"}.isdisjoint(left_out["algorithm"])
+    assert "settings" not in left_out["training"]
+    assert (shown["algorithm"]["features"], shown["algorithm"]["learning_rate_end"]) == ("observation", None)
+    assert (shown["algorithm"]["n_steps"], shown["training"]["settings"]) == (3, [])
+    assert Config.from_dict(shown) == Config.from_dict(left_out) == config
+
+
+def test_settings_are_in_the_scenarios_scene() -> None:
+    for scene in ("concave", "tunnel"):
+        setting = f"{{speed_ratio: 1.1, pursuers: 3, obstacles: 1, scene: {scene}}}"
+        overrides = ["algorithm.features=set", f"training.settings=[{setting}]"]
+        assert "scene: must be scenario.scene, random" in refused(overrides=overrides)
+        config = load_config(overrides=[*overrides, f"scenario.scene={scene}"])
+        assert config.settings == [Setting(1.1, 3, 1, scene)]
 
 
 def test_a_policy_may_fill_half_of_what_is_read_back_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
