@@ -12,6 +12,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import metadata
+from tensorboard.summary.writer import event_file_writer
 from tiny_runs import contents, copy_of_finished, everything_in, finished, tiny
 
 from marl_encircle import files
@@ -27,6 +28,12 @@ from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.thumbnails import thumbnails
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
+
+
+@pytest.fixture(autouse=True)
+def _names_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Event files of one process and second are read in the order of their names, in which 10 comes before 9."""
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(1000))
 
 
 def events_of(folder: Path) -> EventAccumulator:
