@@ -56,6 +56,7 @@ class MixedVecEnv(SlotVecEnv):
             for i, s in enumerate(scenarios)
         ]
         low, high = bounds(largest)
+        self._size = len(low)
         super().__init__(n_worlds * self.n_agents, spaces.Box(low, high), spaces.Box(-1.0, 1.0, (ACTION_SIZE,)))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -136,13 +137,13 @@ class MixedVecEnv(SlotVecEnv):
 
     def _infos_of_world(self, part: _Part, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the infos of all slots of a world whose round has ended."""
-        last = np.zeros((self.n_agents, *self.observation_space.shape), np.float32)  # type: ignore[misc]  # a Box has a shape
+        last = np.zeros((self.n_agents, self._size), np.float32)
         last[: len(infos), part.columns] = [info["terminal_observation"] for info in infos]
         return [{**infos[min(i, len(infos) - 1)], "terminal_observation": last[i]} for i in range(self.n_agents)]
 
     def _padded(self, observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the observations of all slots from those of each part."""
-        out = np.zeros((self.n_worlds, self.n_agents, *self.observation_space.shape), np.float32)  # type: ignore[misc]  # a Box has a shape
+        out = np.zeros((self.n_worlds, self.n_agents, self._size), np.float32)
         for (env, worlds, columns), own in zip(self._parts, observations, strict=True):
             out[worlds, : env.n_agents, columns] = own.reshape(env.n_worlds, env.n_agents, -1)
         return out.reshape(self.num_envs, -1)
