@@ -9,6 +9,7 @@ A temporary file which a killed process left behind is removed by the next save 
 """
 
 import errno
+import gzip
 import hashlib
 import itertools
 import json
@@ -16,12 +17,16 @@ import os
 import shutil
 import socket
 import stat
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 TEMPORARY_PREFIX = ".tmp"
+
+COMPRESSED = ".gz"
+"""Ends the name of a file that is kept compressed, in place of the one that it holds."""
 
 # What the kernel says on opening a folder, a loop of links, a socket, a device without a driver.
 _NOT_REGULAR = (errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.ENODEV)
@@ -242,10 +247,10 @@ def _open_at_once(name: str, flags: int) -> int:
 
 
 def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | None = None) -> bytes:
-    """Read a file that somebody else may have changed.
+    """Read a file that somebody else may have changed, or may keep compressed under its name with ``.gz``.
 
     :param path: the file
-    :param sha256: what it must hash to, in hexadecimal
+    :param sha256: what it must hash to, in hexadecimal, uncompressed
     :param max_bytes: size above which it is refused unread
     :return: its content
     :raises DamagedFileError: when it is missing, no regular file, too large or not what was written
@@ -253,8 +258,12 @@ def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | 
     path = Path(path)
     limit = -1 if max_bytes is None else max_bytes + 1
     try:
-        with open_regular(path) as file:
-            data = file.read(limit)
+        if not path.exists() and compressed(path).exists():
+            path = compressed(path)
+            data = _decompress(path, limit)
+        else:
+            with open_regular(path) as file:
+                data = file.read(limit)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise DamagedFileError(path, "the file is missing") from error
     if max_bytes is not None and len(data) > max_bytes:
@@ -264,6 +273,25 @@ def read_bytes(path: str | Path, *, sha256: str | None = None, max_bytes: int | 
             path, f"changed since it was written: sha256 is {sha256_bytes(data)}, expected {sha256[:80]}"
         )
     return data
+
+
+def compressed(path: Path) -> Path:
+    """Return the name under which a file would be kept compressed."""
+    return path.with_name(path.name + COMPRESSED)
+
+
+def is_kept(path: Path) -> bool:
+    """Whether there is such a file, compressed or not."""
+    return path.exists() or compressed(path).exists()
+
+
+def _decompress(path: Path, limit: int) -> bytes:
+    """Return what a compressed file holds, no more than ``limit`` bytes of it unless that is -1."""
+    try:
+        with open_regular(path) as file, gzip.GzipFile(fileobj=file) as content:
+            return content.read(limit)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise DamagedFileError(path, f"not a whole gzip file: {error}") from error
 
 
 def sha256_bytes(data: bytes) -> str:

@@ -1,5 +1,6 @@
 """Made-up evaluation rounds, runs and run folders, written through the package's own writer, and tables read back."""
 
+import gzip
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,6 +41,12 @@ def markdown_row(text: str, *start: str) -> list[str]:
     """The only row that starts with these cells, without them."""
     [row] = [row for row in markdown_rows(text) if row[: len(start)] == list(start)]
     return row[len(start) :]
+
+
+def compress(path: Path) -> None:
+    """Keep a file compressed, as those of ``results/`` are."""
+    files.compressed(path).write_bytes(gzip.compress(path.read_bytes()))
+    path.unlink()
 
 
 def write_run(

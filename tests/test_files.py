@@ -1,4 +1,5 @@
 import errno
+import gzip
 import json
 import os
 import random
@@ -275,6 +276,35 @@ def test_reading_refuses_what_is_missing_large_or_changed(tmp_path: Path) -> Non
         files.read_bytes(path, sha256=files.sha256_bytes(NEW))
     assert caught.value.path == path
     assert str(path) in str(caught.value)
+
+
+def test_a_compressed_file_stands_for_what_it_holds(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    assert not files.is_kept(path)
+    files.compressed(path).write_bytes(gzip.compress(OLD))
+    assert files.is_kept(path)
+    assert files.read_bytes(path, sha256=files.sha256_bytes(OLD), max_bytes=len(OLD)) == OLD
+    assert files.read_bytes(path) == OLD
+    path.write_bytes(NEW)
+    assert files.read_bytes(path) == NEW
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (gzip.compress(OLD)[:-9], "not a whole gzip file"),
+        (gzip.compress(OLD)[:-4] + b"size", "not a whole gzip file"),
+        (OLD, "not a whole gzip file"),
+        (gzip.compress(OLD)[:10] + OLD, "not a whole gzip file"),
+        (gzip.compress(bytes(1 << 20)), "larger than the 1000 bytes"),
+        (gzip.compress(NEW), "changed since it was written"),
+    ],
+    ids=["cut off", "another size", "not compressed", "no deflate stream", "a bomb", "another content"],
+)
+def test_a_damaged_compressed_file_is_an_error_that_names_it(tmp_path: Path, data: bytes, reason: str) -> None:
+    files.compressed(tmp_path / "f").write_bytes(data)
+    with pytest.raises(files.DamagedFileError, match=rf"f\.gz: {reason}"):
+        files.read_bytes(tmp_path / "f", sha256=files.sha256_bytes(OLD), max_bytes=1000)
 
 
 def test_a_pipe_is_refused_at_once_since_nobody_may_ever_write_to_it(tmp_path: Path) -> None:

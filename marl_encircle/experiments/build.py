@@ -22,7 +22,7 @@ from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, Profile, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
 from marl_encircle.experiments.pretrained import find_run, in_words, is_run_path, pretrained_runs, setting_of
-from marl_encircle.experiments.records import read_record
+from marl_encircle.experiments.records import POLICY, read_record
 from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -32,9 +32,6 @@ from marl_encircle.maddpg.saving import load_actors
 from marl_encircle.spelling import nearest
 
 Engine = Literal["native", "supersuit"]
-
-POLICY = "policy.safetensors"
-"""The actors' weights in a run folder."""
 
 MAX_HEADER_BYTES = 1 << 16
 """Largest header of one: names and shapes of a few arrays per layer. Each name costs memory, whatever it stands for."""

@@ -14,6 +14,9 @@ from marl_encircle import files
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.simulator import world_seeds
 
+POLICY = "policy.safetensors"
+"""The actors' weights in a run folder."""
+
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
 MAX_FILE = 1 << 28
@@ -192,15 +195,16 @@ def episodes_name(setting: Setting | None = None) -> str:
     return "episodes.csv" if setting is None else f"episodes_{setting_name(setting)}.csv"
 
 
-def read_runs(folder: str | Path) -> list[Run]:
+def read_runs(folder: str | Path, *, policies: bool = True) -> list[Run]:
     """Read every run folder below a folder, hashes checked.
 
     :param folder: e.g. ``results/runs``; a missing one has no runs
+    :param policies: whether every run must still have its policy, which its rounds do not need
     :return: runs in the order of method, setting, seed
     :raises files.DamagedFileError: for a folder that is no run folder or a file that is not what the run wrote, by name
     """
     runs = [
-        _read_run(seed_folder, Cell(method_folder.name, read_setting(setting_folder)), _seed(seed_folder))
+        _read_run(seed_folder, Cell(method_folder.name, read_setting(setting_folder)), _seed(seed_folder), policies)
         for method_folder in _subfolders(Path(folder))
         for setting_folder in _subfolders(method_folder)
         for seed_folder in _subfolders(setting_folder)
@@ -245,7 +249,7 @@ def _check_spelling(folder: Path, name: str) -> None:
         raise files.DamagedFileError(folder, f"the folder must be named {name}")
 
 
-def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
+def _read_run(folder: Path, cell: Cell, seed: int, policies: bool) -> Run:
     """Read one run folder; without ``run.json``, which is written last, the run is unfinished."""
     if not (folder / "run.json").exists():
         return Run(cell, seed, "unfinished")
@@ -253,11 +257,13 @@ def _read_run(folder: Path, cell: Cell, seed: int) -> Run:
     _check_place(folder / "run.json", record, cell, seed)
     closure: Closure = record["config"]["reward"]["closure"]
     hashes = sorted(record["sha256"].items())
+    if not policies:
+        hashes = [(name, value) for name, value in hashes if name != POLICY]
     contents = {name: files.read_bytes(folder / name, sha256=value, max_bytes=MAX_FILE) for name, value in hashes}
     if record["status"] == "diverged":
         return Run(cell, seed, "diverged", closure)
     if "episodes.csv" not in contents:
-        if (folder / "episodes.csv").exists():
+        if files.is_kept(folder / "episodes.csv"):
             raise files.DamagedFileError(folder / "episodes.csv", "its hash is not in run.json")
         return Run(cell, seed, "not evaluated", closure)
     asked = record["config"]["evaluation"]
@@ -377,7 +383,7 @@ def _fault_of_hashes(hashes: Any) -> str | None:
     for name in hashes:
         if re.fullmatch(r"\w[\w.-]*", name) is None:
             return f"sha256 has {name!r:.80}, not a plain file name"
-    return None if "policy.safetensors" in hashes else "sha256 has no policy.safetensors"
+    return None if POLICY in hashes else f"sha256 has no {POLICY}"
 
 
 def _is_count(value: Any, least: int) -> bool:

@@ -245,6 +245,7 @@ def write_episodes(folder: Path, episodes: list[Episode], setting: Setting | Non
     record = read_record(folder)
     record["sha256"] = dict(sorted({**record["sha256"], name: files.sha256_bytes(data)}.items()))
     files.write_bytes(folder / name, data)
+    files.remove(files.compressed(folder / name))
     files.write_json(folder / "run.json", record)
 
 

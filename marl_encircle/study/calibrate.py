@@ -129,7 +129,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
 def _measure(protocol: Protocol, changes: Changes, folder: Path) -> Trial:
     """Read the trainings of one scenario."""
     jobs, results, distance = jobs_of(protocol, changes), [], 0.0
-    runs = {(run.cell.setting, run.seed): run for run in read_runs(folder)}
+    runs = {(run.cell.setting, run.seed): run for run in read_runs(folder, policies=False)}
     for cell in protocol.cells:
         config = next(job.config for job in jobs if job.setting == cell.setting)
         summary = summarise_cell(

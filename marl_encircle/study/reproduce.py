@@ -62,7 +62,7 @@ def reproduce(
         missing = [
             setting
             for setting in settings
-            if (name := episodes_name(setting)) not in hashes or not (folder / name).exists()
+            if (name := episodes_name(setting)) not in hashes or not files.is_kept(folder / name)
         ]
         if missing:
             policy, config, record = load_run(folder)

@@ -57,7 +57,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     """
     texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
-    folders = [folder for folder in folders if (folder / "episodes.csv").exists()]
+    folders = [folder for folder in folders if files.is_kept(folder / episodes_name())]
     rounds = equal = 0
     exact = True
     successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)

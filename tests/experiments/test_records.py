@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up import episode, write_run
+from made_up import compress, episode, write_run
 
 from marl_encircle import files
 from marl_encircle.core.simulator import world_seeds
@@ -97,6 +97,25 @@ def test_rounds_elsewhere_belong_to_the_run_and_are_checked_like_its_own(tmp_pat
     assert run.episodes == (episode(0, 10), episode(1, None))
     write_episodes(folder, [episode(0, 30)], tunnel)
     with pytest.raises(files.DamagedFileError, match=r"tunnel\.csv.*its 1 rounds are not rounds 0 to 1"):
+        records.read_runs(tmp_path)
+
+
+def test_compressed_rounds_are_the_same_rounds_until_others_take_their_place(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, CELL, 0, (episode(0, 10), episode(1, None)))
+    plain, names = records.read_runs(tmp_path), sorted(path.name for path in folder.iterdir())
+    compress(folder / "episodes.csv")
+    assert records.read_runs(tmp_path) == plain
+    write_episodes(folder, [episode(0, 20), episode(1, 20)])
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert records.read_runs(tmp_path)[0].episodes == (episode(0, 20), episode(1, 20))
+
+
+def test_rounds_stand_without_their_policy_for_who_asks_for_no_policies(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, CELL, 0, (episode(0, 10),))
+    whole = records.read_runs(tmp_path)
+    (folder / "policy.safetensors").unlink()
+    assert records.read_runs(tmp_path, policies=False) == whole
+    with pytest.raises(files.DamagedFileError, match=r"policy\.safetensors: the file is missing"):
         records.read_runs(tmp_path)
 
 
@@ -283,7 +302,7 @@ def test_what_supersuits_worlds_taught_is_what_ours_taught() -> None:
     folder = records.run_path(run.cell, run.seed)
     assert json.loads((reference / folder / "run.json").read_text())["engine"] == "supersuit"
     for name in ("policy.safetensors", "progress.csv", "episodes.csv"):
-        assert (reference / folder / name).read_bytes() == (RESULTS / "runs" / folder / name).read_bytes()
+        assert files.read_bytes(reference / folder / name) == files.read_bytes(RESULTS / "runs" / folder / name)
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"[" * 100_000, b"9" * 5000, b" " * (1 << 21)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tiny_runs import finished, tiny
 
+from marl_encircle import files
 from marl_encircle.core.simulator import Simulator
 from marl_encircle.experiments.build import load_policy, load_run
 from marl_encircle.experiments.config import Config
@@ -51,7 +52,7 @@ def test_success_steps_are_those_of_the_evaluation(method: str) -> None:
 )
 def test_a_committed_round_is_played_as_it_was_recorded(run: str) -> None:
     policy, config, _ = load_run(RUNS / run)
-    rounds = episodes_from_csv((RUNS / run / "episodes.csv").read_text())
+    rounds = episodes_from_csv(files.read_bytes(RUNS / run / "episodes.csv").decode())
     evaluation = config.evaluation
     numbers = [0, 1, 42, 99, 100, len(rounds) - 1]
     played = play_rounds(policy, config, len(rounds), evaluation.seed)

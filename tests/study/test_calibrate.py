@@ -1,5 +1,6 @@
 """Calibration: the protocol as it is written, on trainings that are given or tiny."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,16 @@ def test_the_studys_scenario_is_the_calibrations_outcome() -> None:
     assert load_config("ours") == chosen, "what learns without naming a scenario does so in the study's"
     assert load_config("ours", scenario="centre") != chosen
     assert {job.scenario for job in grids.load_grid("all").jobs} == {"paper"}
+
+
+def test_the_table_of_the_calibration_follows_from_its_trainings(tmp_path: Path) -> None:
+    committed = ROOT / "results" / "calibration"
+    shutil.copytree(committed / "runs", tmp_path / "runs")
+    before = everything_in(tmp_path / "runs")
+    calibrate(load_protocol("calibration"), tmp_path, 1)
+    assert everything_in(tmp_path / "runs") == before
+    for name in ("sensitivity.md", "sensitivity.csv", "scenario.yaml"):
+        assert (tmp_path / name).read_bytes() == (committed / name).read_bytes()
 
 
 def test_a_grid_is_no_protocol() -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from made_up import compress
 from tiny_runs import TINY, copy_of_finished, everything_in
 
 from marl_encircle import files
@@ -46,6 +47,11 @@ def test_what_was_recorded_here_is_played_again_to_the_last_bit(results: Path) -
     assert found.passed
     assert seen == [(1, 1)]
     assert everything_in(results) == before
+
+
+def test_compressed_rounds_are_played_again_too(results: Path) -> None:
+    compress(run_folder(GRID.jobs[0].config, 0, results / "runs") / "episodes.csv")
+    assert verify(GRID, results) == Verification(rounds=8, equal=8, cells_off=0, exact=True, changed=())
 
 
 def test_another_figure_of_a_round_is_found(results: Path) -> None:
