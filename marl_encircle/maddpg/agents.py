@@ -1,0 +1,48 @@
+"""What an environment tells of the agents in its worlds: how many, and their names."""
+
+from typing import Any
+
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+
+def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
+    """Return the number of agents in each world of ``env``.
+
+    :param env: an environment tells it by an attribute ``n_agents``; a Gymnasium environment, alone or in SB3's
+        ``DummyVecEnv`` and ``SubprocVecEnv``, has one; of others it is not known. None: a model without one
+    :param n_agents: what the user or a saved model says
+    :raises ValueError: where it is not known, differs from ``n_agents`` or does not divide the number of slots
+    """
+    told = None
+    if isinstance(env, VecEnv):
+        told = getattr(env, "n_agents", None)
+        inner: Any = env
+        while isinstance(inner, VecEnvWrapper):
+            inner = inner.venv
+        if told is None and (isinstance(inner, DummyVecEnv | SubprocVecEnv) or env.num_envs == 1):
+            told = 1
+    elif env is not None:
+        told = 1
+    if told is not None and n_agents is not None and told != n_agents:
+        raise ValueError(f"the environment has n_agents={told}, but n_agents={n_agents} was given or saved")
+    n = n_agents if told is None else int(told)
+    if n is None:
+        raise ValueError(
+            "the environment has several slots but does not tell how many of them are the agents of one world: "
+            "build it with make_vec_env, or give n_agents=..."
+        )
+    if isinstance(env, VecEnv) and (n < 1 or env.num_envs % n):
+        raise ValueError(f"{env.num_envs} slots are no whole number of worlds with n_agents={n}")
+    return n
+
+
+def names_of_agents(env: GymEnv | None, n_agents: int) -> tuple[str, ...] | None:
+    """Return the agents' names in the order of the slots.
+
+    :param env: an environment tells them by an attribute ``agents``
+    :param n_agents: number of agents N
+    :return: None where there is no such attribute, or it does not name each agent of a world
+    """
+    agents = getattr(env, "agents", None) if isinstance(env, VecEnv) else None
+    return tuple(agents) if isinstance(agents, list | tuple) and len(agents) == n_agents else None
