@@ -4,6 +4,7 @@ A card has no clock and no opinion in it: the same run gives the same bytes.
 """
 
 import shlex
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,7 +27,7 @@ _RULES = {"all": "pursuers and obstacles enclose the target together", "pursuers
 _LIMITS = """\
 - This is one training seed, the first and not the best: another gives another policy. The interval of S holds the noise
   of the evaluation rounds only; the tables have the intervals over the training seeds.
-- It was trained and measured for these numbers of pursuers and obstacles, this speed ratio and these rules only.
+- {limit}
 - The target follows one fixed rule. Nothing is known about targets that learn, nor about anything but a simulation.
 
 ## Safe to load
@@ -34,6 +35,14 @@ _LIMITS = """\
 The weights are safetensors and the record is JSON: nothing in these files can run code. `load_policy` reads no more of
 them than a policy needs, and refuses them unless hashes, names, shapes and types are right and every number is finite.
 """
+
+
+_ONE_SETTING = (
+    "It was trained and measured for these numbers of pursuers and obstacles, this speed ratio and these rules only."
+)
+_SEVERAL_SETTINGS = """\
+It was trained in these settings and under these rules only. The figures above are of one setting, the tables have
+  those of the others that it was measured in, some of which it never saw."""
 
 
 def render_cards(grid: Grid, runs: Iterable[Run], folder: Path) -> dict[str, str]:
@@ -64,10 +73,13 @@ def render_card(record: Mapping[str, Any], episodes: Sequence[Episode], command:
     """
     config = Config.from_dict(record["config"])
     method, setting = config.cell
+    several = config.training.settings
+    whose = "any number of" if several else setting.pursuers
+    limits = _LIMITS.format(limit=_SEVERAL_SETTINGS if several else _ONE_SETTING)
     return f"""\
 # {label(method)} {in_words(setting)}
 
-A policy for {setting.pursuers} pursuers that enclose one faster target; each acts on what it observes itself. It was
+A policy for {whose} pursuers that enclose one faster target; each acts on what it observes itself. It was
 trained by marl-encircle with {config.algorithm.name.upper()}.
 
 {_facts(record, config, summarise_run(episodes, config.reward.closure))}
@@ -86,7 +98,7 @@ trained by marl-encircle with {config.algorithm.name.upper()}.
 
 ## Limits
 
-{_LIMITS}"""
+{limits}"""
 
 
 def _facts(record: Mapping[str, Any], config: Config, summary: RunSummary) -> str:
@@ -96,6 +108,7 @@ def _facts(record: Mapping[str, Any], config: Config, summary: RunSummary) -> st
     rows = {
         "method": f"`{config.reward.name}`; a round is won once {_RULES[config.reward.closure]}",
         "setting": f"{in_words(config.cell.setting).removeprefix('with ')}; scene: {config.scenario.scene}",
+        **_trained_in(config),
         "scenario": ", ".join(f"`{rule}`" for rule in _rules(config.scenario)) or "the default rules",
         "success S": f"{100 * summary.success:.1f} %; Wilson's 95 % interval: {100 * low:.1f} to {100 * high:.1f} %",
         "mean episode length MEL": "no round was won" if length is None else f"{length:.2f} steps, of the rounds won",
@@ -106,6 +119,15 @@ def _facts(record: Mapping[str, Any], config: Config, summary: RunSummary) -> st
         "policy.safetensors": f"sha256 `{record['sha256']['policy.safetensors']}`",
     }
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows.items())])
+
+
+def _trained_in(config: Config) -> dict[str, str]:
+    """Return the settings of a training in several, each with its share of the worlds where that is not one."""
+    if not config.training.settings:
+        return {}
+    shares = Counter(config.settings).items()
+    texts = [in_words(setting).removeprefix("with ") + (f" ({n} shares)" if n > 1 else "") for setting, n in shares]
+    return {"trained in": "; ".join(texts)}
 
 
 def _program(config: Config) -> str:
