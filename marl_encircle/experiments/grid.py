@@ -57,11 +57,13 @@ class GridConfig(Section):
 
     :param elsewhere: scenes that no run was trained in
     :param frozen: the commit in which scenario and recipe were frozen, 40 hexadecimal digits; the tables name it
+    :param amended: what has changed in them since, in a sentence
     """
 
     profile: Profile
     scenario: str = "default"
     frozen: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
+    amended: Annotated[str, Field(min_length=1, max_length=500)] | None = None
     groups: Annotated[list[Group], Field(min_length=1)]
     shared: list[Shared]
     elsewhere: Annotated[list[Elsewhere], Field(default_factory=list)]
@@ -107,12 +109,14 @@ class Grid(NamedTuple):
 
     :param aliases: cell -> the cell whose runs it shares
     :param frozen: the commit in which scenario and recipe were frozen
+    :param amended: what has changed in them since, in a sentence
     :param elsewhere: setting of a training -> other settings in which its policies are played too
     """
 
     jobs: tuple[Job, ...]
     aliases: dict[Cell, Cell]
     frozen: str | None = None
+    amended: str | None = None
     elsewhere: Mapping[Setting, tuple[Setting, ...]] = MappingProxyType({})
 
     @property
@@ -172,7 +176,7 @@ def load_grid(name: str) -> Grid:
     in_order = tuple(sorted(jobs, key=lambda job: job.seed))
     with naming_file(path):
         elsewhere = _elsewhere(in_order, grid.elsewhere, asked)
-    return Grid(in_order, aliases, grid.frozen, elsewhere)
+    return Grid(in_order, aliases, grid.frozen, grid.amended, elsewhere)
 
 
 @contextmanager

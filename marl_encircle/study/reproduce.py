@@ -11,16 +11,17 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid, load_grid
 from marl_encircle.experiments.grid_runs import runs_of
-from marl_encircle.experiments.records import episodes_name, read_record
+from marl_encircle.experiments.records import episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
+from marl_encircle.study.amendment import AMENDMENT_TABLES, FORMER, render_amendment
 from marl_encircle.study.cards import render_cards
 from marl_encircle.study.cells import gather
 from marl_encircle.study.paper import reported_cells
 from marl_encircle.study.protocol import calibrated_cells
 from marl_encircle.study.scenes import SCENE_TABLES, render_scenes
-from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, frozen_note, render_table1, render_tables
+from marl_encircle.study.tables import OTHER_TABLES, MethodOptions, freeze_notes, render_table1, render_tables
 
 TABLE1_METHODS = ("model_a", "model_b", "model_c", "ours")
 
@@ -84,7 +85,7 @@ def write_tables(grid: Grid, results: str | Path) -> list[Path]:
     :raises DamagedFileError: if a run there is not what its record says
     """
     texts = render(grid, results)
-    for name in (*OTHER_TABLES, *SCENE_TABLES, *AGREEMENT_TABLES):
+    for name in (*OTHER_TABLES, *SCENE_TABLES, *AGREEMENT_TABLES, *AMENDMENT_TABLES):
         if f"tables/{name}" not in texts:
             (Path(results) / "tables" / name).unlink(missing_ok=True)
     for name, text in texts.items():
@@ -100,14 +101,17 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
     :raises DamagedFileError: if a run there is not what its record says
     """
-    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, grid.frozen)
+    notes = freeze_notes(grid.frozen, grid.amended)
+    texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, notes)
     folder = Path(results) / "runs"
-    runs = runs_of(grid, folder)
-    texts |= render_tables(runs, grid.aliases, grid.cells, grid.frozen)
-    texts |= render_scenes(runs, grid.elsewhere, grid.frozen)
+    runs, cells = runs_of(grid, folder), grid.cells
+    texts |= render_tables(runs, grid.aliases, cells, notes)
+    texts |= render_scenes(runs, grid.elsewhere, notes)
+    by_cell = gather(runs, grid.aliases)
+    former = [run for run in read_runs(Path(results) / FORMER, policies=False) if run.cell in cells]
+    texts |= render_amendment(former, by_cell, notes)
     if grid.frozen:
-        by_cell = gather(runs, grid.aliases)
-        texts |= render_agreement(by_cell, reported_cells(), calibrated_cells(), frozen_note(grid.frozen))
+        texts |= render_agreement(by_cell, reported_cells(), calibrated_cells(), notes)
     cards = {f"runs/{name}": text for name, text in render_cards(grid, runs, folder).items()}
     return {f"tables/{name}": text for name, text in texts.items()} | cards
 

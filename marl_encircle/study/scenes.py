@@ -1,12 +1,12 @@
 """What the policies are worth in scenes that they were never trained in."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from marl_encircle.experiments.records import Cell, Run, Setting
 from marl_encircle.study.cells import gather, result_of, run_elsewhere
 from marl_encircle.study.paper import label, rank
 from marl_encircle.study.paper_layout import notes_on, success_and_length
-from marl_encircle.study.tables import frozen_note, record_of
+from marl_encircle.study.tables import record_of
 from marl_encircle.study.typeset import Text, markdown, to_csv
 
 SCENE_TABLES = ("table_scenes.md", "table_scenes.csv")
@@ -19,13 +19,13 @@ _NOTES: list[Text] = [
 
 
 def render_scenes(
-    runs: Iterable[Run], elsewhere: Mapping[Setting, Iterable[Setting]], frozen: str | None = None
+    runs: Iterable[Run], elsewhere: Mapping[Setting, Iterable[Setting]], notes: Sequence[str] = ()
 ) -> dict[str, str]:
     """Return ``table_scenes.md`` and ``.csv`` -> text; nothing where no policy was played in another scene.
 
     :param runs: those that were played in no other scene are passed over
     :param elsewhere: setting of a training -> other settings to show
-    :param frozen: commit in which scenario and recipe were frozen, for a note
+    :param notes: further ones
     """
     played: list[Run] = []
     for run in runs:
@@ -46,9 +46,8 @@ def render_scenes(
         cells = [Cell(method, setting._replace(scene=scene)) for scene in scenes]
         shown = [success_and_length(results[cell]) if cell in results else "" for cell in cells]
         rows.append([label(method), *(f"{value:g}" for value in setting[:3]), *shown])
-    notes = [*_NOTES, *notes_on(results.values()), *frozen_note(frozen)]
     texts = (
-        markdown(_TITLE, ["Method", "λ", "n", "m", *scenes], rows, notes),
+        markdown(_TITLE, ["Method", "λ", "n", "m", *scenes], rows, [*_NOTES, *notes_on(results.values()), *notes]),
         to_csv([record_of(result, None) for result in results.values()]),
     )
     return dict(zip(SCENE_TABLES, texts, strict=True))

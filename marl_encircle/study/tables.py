@@ -64,7 +64,7 @@ def render_tables(
     runs: Iterable[Run],
     aliases: Mapping[Cell, Cell] | None = None,
     asked: Iterable[Cell] = (),
-    frozen: str | None = None,
+    notes: Sequence[str] = (),
 ) -> dict[str, str]:
     """Tables 2-4, the same results under the common closure rule, the paired differences, and other settings' results.
 
@@ -72,7 +72,7 @@ def render_tables(
         has played in other settings of its scene is shown in these too
     :param aliases: cell -> the cell whose runs it shares when it has none of its own
     :param asked: cells that are shown in the paper's settings even if they have no runs
-    :param frozen: commit in which scenario and recipe were frozen, for a note
+    :param notes: further ones, below those that a table needs
     :return: file name -> text
     :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
     """
@@ -80,44 +80,43 @@ def render_tables(
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))
-    note = frozen_note(frozen)
     rendered: dict[str, str] = {}
     for name, paper in reported.items():
         results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
-        rendered |= _texts(_main_table(name, results, paper, note))
+        rendered |= _texts(_main_table(name, results, paper, notes))
         rendered[f"{name}.csv"] = to_csv([record_of(result, paper.get(result.cell)) for result in results])
-    rendered |= _common_table(cells, by_cell, reported, note)
+    rendered |= _common_table(cells, by_cell, reported, notes)
     if others:
         results = [result_of(cell, by_cell[cell]) for cell in others]
-        other = _other_table(results, note)
+        other = _other_table(results, notes)
         rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
         rendered["table_other.csv"] = to_csv([record_of(result, None) for result in results])
-    return rendered | render_differences(cells, by_cell, note)
+    return rendered | render_differences(cells, by_cell, notes)
 
 
-def render_table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> dict[str, str]:
+def render_table1(options: Mapping[str, MethodOptions], notes: Sequence[str] = ()) -> dict[str, str]:
     """Table 1: what each model has, from its resolved reward config.
 
     :param options: method -> its options, in the order of the rows
-    :param frozen: as in ``render_tables``
+    :param notes: further ones
     :return: file name -> text
     """
     records = [
         {"method": method, **{name: "yes" if has else "no" for name, has in row._asdict().items()}}
         for method, row in options.items()
     ]
-    return {**_texts(table1(options, frozen)), "table1.csv": to_csv(records)}
+    return {**_texts(table1(options, notes)), "table1.csv": to_csv(records)}
 
 
-def table1(options: Mapping[str, MethodOptions], frozen: str | None = None) -> Table:
+def table1(options: Mapping[str, MethodOptions], notes: Sequence[str] = ()) -> Table:
     """Table 1 as a table; see :func:`render_table1`."""
     rows = [[label(method), *("✓" if has else "" for has in row)] for method, row in options.items()]
     header = ["Model", "Lion encirclement", "Obstacle-assisted", "Individual contributing angle"]
-    return Table("table1", _TABLE1, header, rows, frozen_note(frozen))
+    return Table("table1", _TABLE1, header, rows, notes)
 
 
 def main_tables(
-    runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[Cell], frozen: str | None = None
+    runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[Cell], notes: Sequence[str] = ()
 ) -> list[Table]:
     """Tables 2-4 and, where there are any, the results of other settings; then the paired differences.
 
@@ -127,14 +126,13 @@ def main_tables(
     reported = paper_results()
     cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
     others = _by_method(by_cell.keys() - set(cells))
-    note = frozen_note(frozen)
     tables = [
-        _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, note)
+        _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, notes)
         for name, paper in reported.items()
     ]
     if others:
-        tables.append(_other_table([result_of(cell, by_cell[cell]) for cell in others], note))
-    return [*tables, difference_table(cells, by_cell, note)]
+        tables.append(_other_table([result_of(cell, by_cell[cell]) for cell in others], notes))
+    return [*tables, difference_table(cells, by_cell, notes)]
 
 
 def _texts(table: Table) -> dict[str, str]:
@@ -146,9 +144,13 @@ def _texts(table: Table) -> dict[str, str]:
     }
 
 
-def frozen_note(frozen: str | None) -> list[str]:
-    """Return the note on the commit in which scenario and recipe were frozen, if there is one."""
-    return [] if frozen is None else [f"Scenario and recipe frozen in commit {frozen[:12]}."]
+def freeze_notes(frozen: str | None, amended: str | None = None) -> list[str]:
+    """Return the notes on the commit in which scenario and recipe were frozen, and on what has changed since, if any.
+
+    :param amended: what has changed, in a sentence
+    """
+    notes = [] if frozen is None else [f"Scenario and recipe frozen in commit {frozen[:12]}."]
+    return notes if amended is None else [*notes, f"Amended since: {amended} table_amendment has both results."]
 
 
 def _ordered(paper: Iterable[Cell], others: Iterable[Cell]) -> list[Cell]:
@@ -163,11 +165,11 @@ def _by_method(cells: Iterable[Cell]) -> list[Cell]:
     return sorted(cells, key=lambda cell: (rank(cell.method), cell))
 
 
-def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], note: Sequence[str]) -> Table:
+def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], more: Sequence[str]) -> Table:
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
     header, rows, seeds = wide(layout, results, paper)
-    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *seeds, *note]
+    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *seeds, *more]
     return Table(name, layout.title, header, rows, notes)
 
 
@@ -175,11 +177,11 @@ def _common_table(
     cells: Sequence[Cell],
     runs: Mapping[Cell, CellRuns],
     reported: Mapping[str, Mapping[Cell, PaperResult]],
-    note: Sequence[str],
+    more: Sequence[str],
 ) -> dict[str, str]:
     """All cells of Tables 2-4 under the common closure rule."""
     results = [result_of(cell, runs.get(cell), "all") for cell in cells]
-    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, columns_compete=True), *note]
+    notes = [_COMMON_CELL_NOTE, _COMMON_RULE_NOTE, *notes_on(results, columns_compete=True), *more]
     sections = [f"# {_COMMON}\n\n" + "".join(f"- {note}\n" for note in notes)]
     for name, paper in reported.items():
         settings = {cell.setting for cell in paper}
@@ -193,7 +195,7 @@ def _common_table(
     }
 
 
-def _other_table(results: Sequence[Result], note: Sequence[str]) -> Table:
+def _other_table(results: Sequence[Result], more: Sequence[str]) -> Table:
     """Cells of other settings, a line for each."""
     rows = [
         [
@@ -205,7 +207,7 @@ def _other_table(results: Sequence[Result], note: Sequence[str]) -> Table:
         ]
         for result in results
     ]
-    notes = [_OWN_RULE_NOTE, *notes_on(results), *note]
+    notes = [_OWN_RULE_NOTE, *notes_on(results), *more]
     return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
 
 

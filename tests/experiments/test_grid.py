@@ -86,6 +86,14 @@ def test_a_grid_may_name_the_commit_in_which_its_recipe_was_frozen(tmp_path: Pat
     assert grid_of(tmp_path, f"frozen: {COMMIT}\n" + GRID.format(method="ours")).frozen == COMMIT
 
 
+def test_a_grid_may_say_what_was_amended_since(tmp_path: Path) -> None:
+    assert grid_of(tmp_path, GRID.format(method="ours")).amended is None
+    amended = grid_of(tmp_path, "amended: twice the budget\n" + GRID.format(method="ours"))
+    assert amended.amended == "twice the budget"
+    with pytest.raises(ConfigError, match="amended: string should have at least 1 character"):
+        grid_of(tmp_path, "amended: ''\n" + GRID.format(method="ours"))
+
+
 def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> None:
     text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: 1}, {scene: tunnel, obstacles: 2}]\n"
     assert grid_of(tmp_path, text).elsewhere == {ONE: (ONE._replace(scene="concave"),)}

@@ -334,13 +334,17 @@ def test_every_table_for_readers_names_the_commit_in_which_the_recipe_was_frozen
     runs = [finished("ours", Setting(1.1, 3, 1, "tunnel"), 0, 90)]
     options = {"ours": MethodOptions(True, True, True)}
 
-    def rendered(frozen: str | None) -> dict[str, str]:
-        return tables.render_tables(runs, frozen=frozen) | tables.render_table1(options, frozen)
+    def rendered(*freeze: str | None) -> dict[str, str]:
+        notes = tables.freeze_notes(*freeze)
+        return tables.render_tables(runs, notes=notes) | tables.render_table1(options, notes)
 
     note = "Scenario and recipe frozen in commit 0123456789ab."
     for name, text in rendered(commit).items():
         assert text.count(note) == (0 if name.endswith(".csv") else 1), name
     assert "frozen" not in "".join(rendered(None).values())
+    amended = "Amended since: the budget is twice as long. table_amendment has both results."
+    for name, text in rendered(commit, "the budget is twice as long.").items():
+        assert text.replace("\\_", "_").count(amended) == text.count(note) == (0 if name.endswith(".csv") else 1), name
 
 
 def test_a_cell_of_mixed_rules_or_seeds_twice_is_an_error_that_names_it() -> None:

@@ -6,7 +6,7 @@ import pytest
 from made_up import finished
 
 from marl_encircle.experiments.records import Setting
-from marl_encircle.study.tables import MethodOptions, render_table1, render_tables
+from marl_encircle.study.tables import MethodOptions, freeze_notes, render_table1, render_tables
 from marl_encircle.study.typeset import Styled, latex, markdown, to_csv
 
 HEADER = ["Method", "λ = 1.1", "n = 2"]
@@ -45,7 +45,7 @@ def assert_sound(text: str) -> None:
 def test_every_latex_table_is_sound() -> None:
     runs = [finished(method, Setting(1.1, 3, 1), seed, 90) for method in ("ours", "my_method") for seed in (0, 1)]
     runs += [finished("ma2019", Setting(1.2, 3, 1), 0, 0, closure="pursuers")]
-    rendered = render_tables(runs, frozen="0123456789abcdef" * 2 + "01234567")
+    rendered = render_tables(runs, notes=freeze_notes("0123456789abcdef" * 2 + "01234567"))
     rendered |= render_table1({"ours": MethodOptions(True, True, False)})
     texts = {name: text for name, text in rendered.items() if name.endswith(".tex")}
     assert sorted(texts) == [f"table{number}.tex" for number in (1, 2, 3, 4)]

@@ -12,7 +12,7 @@ from marl_encircle.study.report.charts import charts
 from marl_encircle.study.report.page import Page, render_page
 from marl_encircle.study.report.replays import player_data, shown_cells
 from marl_encircle.study.reproduce import TABLE1_METHODS, options_of
-from marl_encircle.study.tables import main_tables, table1
+from marl_encircle.study.tables import freeze_notes, main_tables, table1
 from marl_encircle.study.typeset import Table
 
 
@@ -36,11 +36,12 @@ def report(grid: Grid, folder: Path) -> str:
     :param folder: of all runs
     """
     runs = runs_of(grid, folder)
+    notes = freeze_notes(grid.frozen, grid.amended)
     options = {method: options_of(method) for method in TABLE1_METHODS}
-    *tables, differences = main_tables(runs, grid.aliases, grid.cells, grid.frozen)
+    *tables, differences = main_tables(runs, grid.aliases, grid.cells, notes)
     page = Page(
         facts=_facts(grid, runs),
-        tables=[table1(options, grid.frozen), *tables, without_missing(differences)],
+        tables=[table1(options, notes), *tables, without_missing(differences)],
         charts=charts(read_bands(runs, folder), sorted(grid.cells), grid.aliases),
         player=player_data(shown_cells(runs, folder, grid.aliases, grid.cells)),
     )

@@ -1,0 +1,69 @@
+"""What an amendment of the study changed: the results before it beside those after it."""
+
+from collections.abc import Iterable, Mapping
+
+from marl_encircle.experiments.metrics import Difference, success_difference
+from marl_encircle.experiments.records import Cell, Run
+from marl_encircle.study.cells import CellRuns, Result, gather, result_of
+from marl_encircle.study.differences import nothing_to_compare
+from marl_encircle.study.paper import label, rank
+from marl_encircle.study.paper_layout import notes_on, success_and_length
+from marl_encircle.study.tables import record_of
+from marl_encircle.study.typeset import Text, markdown, to_csv, with_interval
+
+AMENDMENT_TABLES = ("table_amendment.md", "table_amendment.csv")
+
+FORMER = "former"
+"""Folder beside ``runs/`` that keeps the rounds of trainings from before an amendment, without their policies."""
+
+_TITLE = "Before and after the amendment"
+_HEADER = ["Method", "λ", "n", "m", "Before", "After", "After minus before: S, points"]
+_NOTES: list[Text] = [
+    "Cells: S [95 % interval] / MEL, each method under its own closure rule.",
+    "After minus before: paired by training seed and evaluation round, with its 95 % interval.",
+]
+
+
+def render_amendment(
+    former: Iterable[Run], runs: Mapping[Cell, CellRuns], notes: Iterable[Text] = ()
+) -> dict[str, str]:
+    """Return ``table_amendment.md`` and ``.csv`` -> text; nothing where nothing was amended.
+
+    :param former: runs of before the amendment
+    :param runs: those of each cell since
+    :param notes: further ones
+    """
+    before = gather(former, {})
+    if not before:
+        return {}
+    cells = sorted(before, key=lambda cell: (rank(cell.method), cell))
+    pairs = [(result_of(cell, before[cell]), result_of(cell, runs.get(cell))) for cell in cells]
+    results = [result for pair in pairs for result in pair]
+    records = [
+        {"amendment": when, **record_of(result, None)}
+        for pair in pairs
+        for when, result in zip(("before", "after"), pair, strict=True)
+    ]
+    texts = (
+        markdown(_TITLE, _HEADER, [_row(*pair) for pair in pairs], [*_NOTES, *notes_on(results), *notes]),
+        to_csv(records),
+    )
+    return dict(zip(AMENDMENT_TABLES, texts, strict=True))
+
+
+def _row(before: Result, after: Result) -> list[Text]:
+    """Write a cell's results in Markdown."""
+    method, setting = before.cell
+    difference = _difference(before.runs, after.runs)
+    shown = "".join(with_interval(difference, 100, "+.1f")) if difference else ""
+    places = [f"{value:g}" for value in setting[:3]]
+    return [label(method), *places, success_and_length(before), success_and_length(after), shown]
+
+
+def _difference(before: CellRuns | None, after: CellRuns | None) -> Difference | None:
+    """Return the paired difference in S under the method's own rule; None where nothing can be compared."""
+    if before is None or after is None or before.closure is None or after.closure is None:
+        return None
+    if nothing_to_compare(before, after) is not None:
+        return None
+    return success_difference(after.finished, before.finished, after.closure, before.closure)
