@@ -164,7 +164,7 @@ def load_moment(run_folder: str | Path) -> Moment:
     tree = checkpoint.load_tree(path)
     try:
         config = Config.from_dict(tree["plan"]["config"])
-        model = build_model(config, build_vec_env(config, 1), tree["plan"]["seed"])
+        model = build_model(config, build_vec_env(config, len(config.settings)), tree["plan"]["seed"])
         checkpoint.restore_parameters(model, tree)
         model.set_logger(Logger(None, []))
         batches = [ReplayBufferSamples(**checkpoint.to_torch(batch)) for batch in tree["batches"]]

@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from tiny_runs import contents, everything_in, finished, tiny
+from tiny_runs import IN_SEVERAL_SETTINGS, contents, everything_in, finished, tiny
 
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
@@ -21,7 +21,12 @@ from marl_encircle.maddpg import MADDPG
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 
 POISONED_AT = 40
-OVERRIDES = {"maddpg": [], "matd3": ["algorithm.name=matd3"], "often": ["algorithm.gradient_steps=3"]}
+OVERRIDES = {
+    "maddpg": [],
+    "matd3": ["algorithm.name=matd3"],
+    "often": ["algorithm.gradient_steps=3"],
+    "settings": IN_SEVERAL_SETTINGS,
+}
 
 
 def poison(monkeypatch: pytest.MonkeyPatch, value: float = np.nan) -> None:
