@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import safetensors.torch
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -197,9 +198,12 @@ def build_policy(config: Config) -> MADDPGPolicy:
 def fit_policy(policy: MADDPGPolicy, config: Config) -> MADDPGPolicy:
     """Return a policy whose features are sets, with the same weights, for other numbers of bodies.
 
+    Draws no random numbers, as a training may be under way.
+
     :param config: the policy's, in the setting to play in
     """
-    fitted = build_policy(config)
+    with th.random.fork_rng(devices=[]):
+        fitted = build_policy(config)
     fitted.actor.load_state_dict(policy.actor.state_dict())
     fitted.set_training_mode(False)
     return fitted

@@ -231,6 +231,15 @@ def test_watching_a_training_does_not_change_it(tmp_path: Path, overrides: list[
         assert contents(folder)[name] == contents(finished())[name]
 
 
+def test_nor_does_watching_one_in_several_settings_with_an_algorithm_that_draws_numbers(tmp_path: Path) -> None:
+    policies = {
+        contents(train.train(config, 0, out=tmp_path / every)[0])["policy.safetensors"]
+        for every in ("20", "400")
+        for config in [tiny(algorithm="matd3", overrides=[*IN_SEVERAL_SETTINGS, f"training.curve_every={every}"])]
+    }
+    assert len(policies) == 1
+
+
 # stopped, and gone on
 
 
