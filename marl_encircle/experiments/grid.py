@@ -110,14 +110,14 @@ class Grid(NamedTuple):
     :param aliases: cell -> the cell whose runs it shares
     :param frozen: the commit in which scenario and recipe were frozen
     :param amended: what has changed in them since, in a sentence
-    :param elsewhere: setting of a training -> other settings in which its policies are played too
+    :param elsewhere: cell of a training -> other settings in which its policies are played too
     """
 
     jobs: tuple[Job, ...]
     aliases: dict[Cell, Cell]
     frozen: str | None = None
     amended: str | None = None
-    elsewhere: Mapping[Setting, tuple[Setting, ...]] = MappingProxyType({})
+    elsewhere: Mapping[Cell, tuple[Setting, ...]] = MappingProxyType({})
 
     @property
     def cells(self) -> set[Cell]:
@@ -144,7 +144,7 @@ def load_grid(name: str) -> Grid:
         return str(path.parent / name) if is_path(name) else name
 
     jobs: dict[Job, None] = {}
-    asked: dict[Setting, tuple[Setting, ...]] = {}
+    asked: dict[Cell, dict[Setting, None]] = {}
     owners: dict[Cell, Job] = {}
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
@@ -168,8 +168,8 @@ def load_grid(name: str) -> Grid:
                 with naming_file(path):
                     _check_same(earlier, first)
                 jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
-                if group.elsewhere:
-                    asked[setting] = tuple(Setting(**other.model_dump()) for other in group.elsewhere)
+                others = (Setting(**other.model_dump()) for other in group.elsewhere)
+                asked.setdefault(cell, {}).update(dict.fromkeys(others))
     for cell, shared in aliases.items():
         if shared not in owners:
             raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
@@ -198,39 +198,57 @@ def _check_same(earlier: Job, later: Job) -> None:
         raise ConfigError(f"{earlier.reward} and {later.reward} have the same method name, {method}")
     lines = difference(earlier.config.to_dict(), later.config.to_dict(), ("first", "then"))
     if lines:
-        where = f"ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
         raise ConfigError(
-            f"{method} at {where} is asked for with two configurations: {lines[0]}; the method of one of them needs "
-            "another name"
+            f"{method} at {_in_words(setting)} is asked for with two configurations: {lines[0]}; the method of one "
+            "of them needs another name"
         )
 
 
 def _elsewhere(
-    jobs: Iterable[Job], entries: Iterable[Elsewhere], asked: Mapping[Setting, tuple[Setting, ...]]
-) -> dict[Setting, tuple[Setting, ...]]:
-    """Return the settings in which the policies of each setting are played too.
+    jobs: Iterable[Job], entries: Iterable[Elsewhere], asked: Mapping[Cell, Iterable[Setting]]
+) -> dict[Cell, tuple[Setting, ...]]:
+    """Return the settings in which the policies of each cell are played too.
 
-    :param asked: those that groups ask for, by the setting of their training
-    :raises ConfigError: for a scene that there is not, or bodies that the policies cannot observe
+    :param asked: those that groups ask for, by the cell of their training
+    :raises ConfigError: for a scene that there is not, bodies that the policies cannot observe, or a cell that would
+        have rounds of two trainings
     """
     jobs = list(jobs)
     trained = {job.setting for job in jobs}
-    played = dict(asked)
+    played = {cell: list(others) for cell, others in asked.items()}
     for job in jobs:
-        for other in asked.get(job.setting, ()):
+        for other in asked[job.config.cell]:
             _check_playable(job, other)
     for i, entry in enumerate(entries):
         if entry.scene not in SCENES:
             raise ConfigError(f"elsewhere.{i}.scene: unknown scene {entry.scene!r:.80}{nearest(entry.scene, SCENES)}")
         for job in jobs:
             other = job.setting._replace(scene=entry.scene)
-            if job.setting.obstacles != entry.obstacles or other in (*trained, *played.get(job.setting, ())):
+            others = played[job.config.cell]
+            if job.setting.obstacles != entry.obstacles or other in (*trained, *others):
                 continue
             scenario = job.config.scenario
             if replace(scenario, scene=entry.scene).units != scenario.units:
                 raise ConfigError(f"elsewhere.{i}.scene: needs composite_unit, or an obstacle there is several here")
-            played[job.setting] = (*played.get(job.setting, ()), other)
-    return played
+            others.append(other)
+    _check_distinct(played)
+    return {cell: tuple(others) for cell, others in played.items() if others}
+
+
+def _check_distinct(played: Mapping[Cell, Iterable[Setting]]) -> None:
+    """Refuse rounds elsewhere that would stand in a cell beside those of another training: neither would be its mean.
+
+    :param played: cell of a training -> other settings
+    """
+    owners = {cell: cell for cell in played}
+    for cell, others in played.items():
+        for other in others:
+            owner = owners.setdefault(Cell(cell.method, other), cell)
+            if owner != cell or other == cell.setting:
+                raise ConfigError(
+                    f"elsewhere: {cell.method} at {_in_words(other)} has the runs of its training at "
+                    f"{_in_words(owner.setting)} already"
+                )
 
 
 def _check_playable(job: Job, other: Setting) -> None:
@@ -246,6 +264,10 @@ def _check_playable(job: Job, other: Setting) -> None:
             f"elsewhere: policies of {job.reward} cannot play with other numbers of bodies than they were trained "
             "with; that needs algorithm.features set"
         )
+
+
+def _in_words(setting: Setting) -> str:
+    return f"ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

@@ -1,14 +1,18 @@
 """The runs of a grid that there are, each one what the grid asks for."""
 
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.records import Run, read_record, read_runs
+from marl_encircle.experiments.records import Episode, Run, Setting, read_record, read_runs
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 
 def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
-    """Return the runs of a grid in the order of method, setting, seed; other runs in the folder are left out.
+    """Return the runs of a grid in the order of method, setting, seed.
+
+    Other runs in the folder are left out, and rounds in settings in which the grid does not ask to play.
 
     :param folder: of all runs
     :raises OtherRunError: if a run has another configuration than the grid asks for, with the difference
@@ -22,4 +26,9 @@ def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
             path = run_folder(config, run.seed, folder)
             # Both engines train the same policy, so that a run of either will do.
             check_same_run(path, config, run.seed, read_record(path).get("engine", "native"))
-    return runs
+    return [replace(run, elsewhere=_of(run.elsewhere, grid.elsewhere.get(run.cell, ()))) for run in runs]
+
+
+def _of(played: Mapping[Setting, Sequence[Episode]], asked: Iterable[Setting]) -> dict[Setting, Sequence[Episode]]:
+    """Return what was played in settings that are asked for, in their order."""
+    return {setting: played[setting] for setting in asked if setting in played}

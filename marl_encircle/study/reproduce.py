@@ -58,7 +58,7 @@ def reproduce(
         if not (folder / "run.json").exists():
             continue
         hashes = read_record(folder)["sha256"]
-        settings = (None, *grid.elsewhere.get(job.setting, ()))
+        settings = (None, *grid.elsewhere.get(job.config.cell, ()))
         # Whatever is stopped between the rounds and their record leaves rounds without a hash.
         missing = [
             setting
@@ -106,7 +106,7 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     folder = Path(results) / "runs"
     runs, cells = runs_of(grid, folder), grid.cells
     texts |= render_tables(runs, grid.aliases, cells, notes)
-    texts |= render_scenes(runs, grid.elsewhere, notes)
+    texts |= render_scenes(runs, notes)
     by_cell = gather(runs, grid.aliases)
     former = [run for run in read_runs(Path(results) / FORMER, policies=False) if run.cell in cells]
     texts |= render_amendment(former, by_cell, notes)

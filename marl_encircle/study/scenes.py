@@ -1,8 +1,8 @@
 """What the policies are worth in scenes that they were never trained in."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
-from marl_encircle.experiments.records import Cell, Run, Setting
+from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import gather, result_of, run_elsewhere
 from marl_encircle.study.paper import label, rank
 from marl_encircle.study.paper_layout import notes_on, success_and_length
@@ -18,22 +18,15 @@ _NOTES: list[Text] = [
 ]
 
 
-def render_scenes(
-    runs: Iterable[Run], elsewhere: Mapping[Setting, Iterable[Setting]], notes: Sequence[str] = ()
-) -> dict[str, str]:
+def render_scenes(runs: Iterable[Run], notes: Sequence[str] = ()) -> dict[str, str]:
     """Return ``table_scenes.md`` and ``.csv`` -> text; nothing where no policy was played in another scene.
 
     :param runs: those that were played in no other scene are passed over
-    :param elsewhere: setting of a training -> other settings to show
     :param notes: further ones
     """
     played: list[Run] = []
     for run in runs:
-        others = [
-            other
-            for other in elsewhere.get(run.cell.setting, ())
-            if other in run.elsewhere and other.scene != run.cell.setting.scene
-        ]
+        others = [other for other in run.elsewhere if other.scene != run.cell.setting.scene]
         if others:
             played += [run, *(run_elsewhere(run, other) for other in others)]
     if not played:

@@ -66,7 +66,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
         same_processor = record.get("cpu") == cpu_model()
         exact &= same_processor
         closure = config.reward.closure
-        for setting in (None, *grid.elsewhere.get(config.cell.setting, ())):
+        for setting in (None, *grid.elsewhere.get(config.cell, ())):
             name = episodes_name(setting)
             if name not in record["sha256"]:
                 continue

@@ -15,6 +15,7 @@ from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.paper import paper_results
 
 ONE = Setting(1.1, 3, 1)
+OURS = Cell("ours", ONE)
 
 
 def grid_of(folder: Path, text: str) -> Grid:
@@ -96,9 +97,9 @@ def test_a_grid_may_say_what_was_amended_since(tmp_path: Path) -> None:
 
 def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> None:
     text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: 1}, {scene: tunnel, obstacles: 2}]\n"
-    assert grid_of(tmp_path, text).elsewhere == {ONE: (ONE._replace(scene="concave"),)}
+    assert grid_of(tmp_path, text).elsewhere == {OURS: (ONE._replace(scene="concave"),)}
     study = load_grid("all").elsewhere
-    assert {setting.obstacles for setting in study} == {1}
+    assert {cell.setting.obstacles for cell in study} == {1}
     assert {len(others) for others in study.values()} == {2}
 
 
@@ -129,12 +130,54 @@ shared: []
 
 
 def test_policies_of_sets_are_played_with_other_bodies(tmp_path: Path) -> None:
-    assert grid_of(tmp_path, SETS % ("set", 5)).elsewhere == {ONE: (Setting(1.2, 7, 5),)}
+    assert grid_of(tmp_path, SETS % ("set", 5)).elsewhere == {OURS: (Setting(1.2, 7, 5),)}
     for features in ("observation", "relative"):
         with pytest.raises(ConfigError, match="elsewhere: policies of ours cannot play with other numbers of bodies"):
             grid_of(tmp_path, SETS % (features, 5))
     with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere: scenario\.obstacles must be"):
         grid_of(tmp_path, SETS % ("set", -1))
+
+
+def setting_of(pursuers: int) -> str:
+    return f"{{speed_ratio: 1.1, pursuers: {pursuers}, obstacles: 1}}"
+
+
+def group(method: str, pursuers: int, *elsewhere: int, features: str = "set") -> str:
+    return f"""\
+  - methods: [{method}]
+    overrides: [algorithm.features={features}]
+    settings: [{setting_of(pursuers)}]
+    seeds: [0]
+    elsewhere: [{", ".join(map(setting_of, elsewhere))}]
+"""
+
+
+def groups(*some: str) -> str:
+    return f"profile: smoke\ngroups:\n{''.join(some)}shared: []\n"
+
+
+def test_where_one_group_is_played_too_is_not_asked_of_another(tmp_path: Path) -> None:
+    text = groups(group("ours", 3, 5, 7, 5), group("model_b", 3, 4), group("ma2019", 3, features="observation"))
+    assert grid_of(tmp_path, text).elsewhere == {
+        OURS: (Setting(1.1, 5, 1), Setting(1.1, 7, 1)),
+        Cell("model_b", ONE): (Setting(1.1, 4, 1),),
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "pursuers", "of"),
+    [
+        (groups(group("ours", 3, 3)), 3, 3),
+        (groups(group("ours", 3, 4), group("ours", 4)), 4, 4),
+        (groups(group("ours", 3, 5), group("ours", 4, 5)), 5, 3),
+    ],
+    ids=["its own setting", "that of another training", "that another training is played in"],
+)
+def test_no_cell_has_rounds_of_two_trainings(tmp_path: Path, text: str, pursuers: int, of: int) -> None:
+    where = f"ratio 1.1, n={pursuers}, m=1, random"
+    fault = f"elsewhere: ours at {where} has the runs of its training at ratio 1.1, n={of},"
+    with pytest.raises(ConfigError, match=fault):
+        grid_of(tmp_path, text)
 
 
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:

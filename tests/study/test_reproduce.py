@@ -103,6 +103,11 @@ def test_one_policy_fills_the_cells_of_several_settings(tmp_path: Path, monkeypa
     assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
     assert verify(load_grid(str(grid)), tmp_path).rounds == 3 * len(run.episodes)
 
+    grid.write_text(ELSEWHERE.partition("elsewhere")[0])  # what has been played elsewhere is not asked for any more
+    reproduce(str(grid), tmp_path, 1)
+    with (tmp_path / "tables" / "table3.csv").open() as file:
+        assert [row["pursuers"] for row in csv.DictReader(file) if row["result"] == "run"] == ["3"]
+
 
 def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
     grid = tmp_path / "grid.yaml"
