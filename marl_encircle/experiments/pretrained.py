@@ -90,22 +90,31 @@ def first_run(cell: Cell, folders: Sequence[Path]) -> Path | None:
     for folder in folders:
         found = _first_seed(folder, cell) or _first_seed(folder, load_grid("committed").aliases.get(cell, cell))
         if found is not None:
-            if read_record(found)["status"] == "diverged":
-                raise ConfigError(
-                    f"{found}: the first training seed of {cell.method} {in_words(cell.setting)} diverged, so the name "
-                    "stands for no policy; give the folder of a run"
-                )
+            _check_not_diverged(found, cell)
             return found
     return None
 
 
+def _check_not_diverged(run: Path, cell: Cell) -> None:
+    if read_record(run)["status"] == "diverged":
+        raise ConfigError(
+            f"{run}: the first training seed of {cell.method} {in_words(cell.setting)} diverged, so the name stands "
+            "for no policy; give the folder of a run"
+        )
+
+
 def _run_of_sets(method: str, folders: Sequence[Path]) -> Path | None:
-    """Return a method's first run whose policy serves any setting, since it reads sets; None without one."""
+    """Return a method's first run whose policy serves any setting, since it reads sets; None without one.
+
+    :raises ConfigError: if it diverged
+    """
     for folder in folders:
         for path in sorted({path.parents[1] for path in (folder / method).glob("*/seed*/run.json")}):
-            first = _first_seed(folder, Cell(method, read_setting(path)))
+            cell = Cell(method, read_setting(path))
+            first = _first_seed(folder, cell)
             algorithm = read_record(first)["config"].get("algorithm") if first else None
-            if isinstance(algorithm, dict) and algorithm.get("features") == "set":
+            if first and isinstance(algorithm, dict) and algorithm.get("features") == "set":
+                _check_not_diverged(first, cell)
                 return first
     return None
 

@@ -10,10 +10,11 @@ import pytest
 from made_up import episode, write_run
 from tiny_runs import IN_SEVERAL_SETTINGS, finished, tiny
 
+from marl_encircle import files
 from marl_encircle.experiments import build, pretrained
 from marl_encircle.experiments.build import load_policy, policy_bytes
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run, first_run, pretrained_runs, setting_of
-from marl_encircle.experiments.records import Cell, Setting, run_path
+from marl_encircle.experiments.records import Cell, Setting, read_record, run_path
 from marl_encircle.experiments.sizes import observation_size
 from marl_encircle.experiments.train import train
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -95,6 +96,15 @@ def test_a_policy_of_sets_stands_for_any_setting(tmp_path: Path, monkeypatch: py
         assert policy.agents == scenario.agents
     with pytest.raises(ConfigError, match=r"scenario\.speed_ratio must be between"):
         load_policy("ours", speed_ratio=0.5)
+
+
+def test_a_policy_of_sets_whose_first_seed_diverged_stands_for_none(tmp_path: Path) -> None:
+    folder, _ = train(tiny(overrides=IN_SEVERAL_SETTINGS), 3, out=tmp_path)
+    record = {**read_record(folder), "status": "diverged"}
+    files.write_json(folder / "run.json", record)
+    for fields in ({}, {"pursuers": 2}):
+        with pytest.raises(ConfigError, match=f"{folder}: the first training seed of ours with 3 pursuers .* diverged"):
+            find_run("ours", setting_of(fields), [tmp_path])
 
 
 def test_without_obstacles_model_a_is_ours(installed: Path) -> None:
