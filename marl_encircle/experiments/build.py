@@ -70,6 +70,9 @@ def make_vec_env(
         raise ConfigError("n_envs counts slots, one for each pursuer of each world: give n_worlds")
     config = load_config(reward, profile=profile, scenario=scenario, fields=fields, overrides=overrides)
     _check_integer("n_worlds", n_worlds, least=1)
+    n = len(config.settings)
+    if n_worlds % n:
+        raise ConfigError(f"n_worlds must be a multiple of the {n} settings of training.settings; got {n_worlds}")
     if seed is not None:
         _check_integer("seed", seed, least=0)
     env = build_vec_env(config, n_worlds, engine, curriculum=curriculum)

@@ -13,7 +13,7 @@ import safetensors.torch
 import torch as th
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecMonitor
-from tiny_runs import copy_of_finished, finished, tiny
+from tiny_runs import IN_SEVERAL_SETTINGS, copy_of_finished, finished, tiny
 
 from marl_encircle import files
 from marl_encircle.core.observations import layout
@@ -126,6 +126,10 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
         ({"n_worlds": "8"}, "n_worlds must be an integer of at least 1; got '8'"),
         ({"n_worlds": 0}, "n_worlds must be an integer of at least 1; got 0"),
         ({"n_worlds": 2.0}, "n_worlds must be an integer of at least 1; got 2.0"),
+        (
+            {"n_worlds": 5, "overrides": IN_SEVERAL_SETTINGS},
+            "n_worlds must be a multiple of the 2 settings of training.settings; got 5",
+        ),
         ({"seed": -1}, "seed must be an integer of at least 0; got -1"),
         ({"seed": "0"}, "seed must be an integer of at least 0; got '0'"),
     ],
