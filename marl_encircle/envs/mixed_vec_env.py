@@ -35,7 +35,7 @@ class MixedVecEnv(SlotVecEnv):
 
     N is the number of pursuers of the largest scenario, and observations are laid out as its are. What a world lacks is
     zero: bodies in the observations of those that are there; and the observations and rewards of the slots of pursuers
-    that are not, whose actions do nothing. Otherwise as ``EncirclementVecEnv``.
+    that are not, whose actions do nothing and whose infos say ``absent``. Otherwise as ``EncirclementVecEnv``.
 
     :param largest: it has the most pursuers, the most obstacles and the highest speed ratio
     :param scenarios: of the worlds, in this order; they differ from the largest in numbers and speed ratio
@@ -139,7 +139,8 @@ class MixedVecEnv(SlotVecEnv):
         """Return the infos of all slots of a world whose round has ended."""
         last = np.zeros((self.n_agents, self._size), np.float32)
         last[: len(infos), part.columns] = [info["terminal_observation"] for info in infos]
-        return [{**infos[min(i, len(infos) - 1)], "terminal_observation": last[i]} for i in range(self.n_agents)]
+        absent = [{**infos[-1], "absent": True}] * (self.n_agents - len(infos))
+        return [{**info, "terminal_observation": last[i]} for i, info in enumerate([*infos, *absent])]
 
     def _padded(self, observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the observations of all slots from those of each part."""

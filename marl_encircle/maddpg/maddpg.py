@@ -416,7 +416,8 @@ class MADDPG(OffPolicyAlgorithm):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Note the return, length and success of the worlds' episodes that ended: means over the world's agents.
 
-        :param infos: ``episode`` of ``Monitor`` and ``is_success`` are read where ``dones``
+        :param infos: ``episode`` of ``Monitor`` and ``is_success`` are read where ``dones``, and none of an agent that
+            is ``absent``
         :param dones: whether the episode ended, shape (B * N,)
         """
         assert self.n_agents is not None
@@ -425,7 +426,8 @@ class MADDPG(OffPolicyAlgorithm):
         if dones is None:
             return
         for world in np.flatnonzero(dones.reshape(-1, self.n_agents).all(axis=1)):
-            world_infos = infos[world * self.n_agents : (world + 1) * self.n_agents]
+            slots = infos[world * self.n_agents : (world + 1) * self.n_agents]
+            world_infos = [info for info in slots if not info.get("absent")]
             episodes = [info["episode"] for info in world_infos if "episode" in info]
             successes = [info["is_success"] for info in world_infos if "is_success" in info]
             if episodes:

@@ -13,6 +13,7 @@ from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
+from marl_encircle.maddpg import MADDPG
 
 LARGEST = Scenario(pursuers=4, obstacles=2, speed_ratio=1.3, max_cycles=5, observe_extras=("speed_ratio",))
 SETTINGS = [{"pursuers": 3, "obstacles": 0, "speed_ratio": 1.1}, {"pursuers": 2, "obstacles": 2}, {}]
@@ -88,6 +89,17 @@ def test_a_pursuer_that_is_not_there_sees_nothing_gets_nothing_and_does_nothing(
         for slot in np.flatnonzero(absent & by_world(dones)):
             assert not infos[slot]["terminal_observation"].any()
             assert infos[slot]["is_success"] == infos[slot // N * N]["is_success"]
+        assert [bool(info.get("absent")) for info in infos] == (absent & by_world(dones)).ravel().tolist()
+
+
+def test_the_mean_return_of_a_round_is_that_of_the_pursuers_that_are_there() -> None:
+    model = MADDPG("MlpPolicy", VecMonitor(make()), learning_starts=1000)
+    rewards: list[np.ndarray] = []
+    model.learn(5 * B * N, callback=lambda found, _: rewards.append(by_world(found["rewards"])) is None)
+    returns = np.sum(rewards, axis=0)
+    expected = [returns[b, : SCENARIOS[b // EACH].pursuers].mean() for b in range(B)]
+    assert model.ep_info_buffer is not None
+    assert [episode["r"] for episode in model.ep_info_buffer] == pytest.approx(expected, abs=1e-5)
 
 
 def test_worlds_differ_and_a_seed_replays_them() -> None:
