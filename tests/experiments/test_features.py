@@ -13,7 +13,7 @@ from marl_encircle.envs.encirclement_v0 import parallel_env
 from marl_encircle.experiments.build import build_model, build_policy, build_vec_env, fit_policy
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
-from marl_encircle.experiments.sizes import count_weights
+from marl_encircle.experiments.sizes import count_weights, observation_size
 from marl_encircle.maddpg.gradients import is_plain
 
 
@@ -90,16 +90,20 @@ def test_a_set_says_where_each_body_is() -> None:
         assert not th.allclose(features_of(scenario, moved, SetFeatures), features, atol=1e-4), name
 
 
+def padded(observations: th.Tensor, scenario: Scenario, largest: Scenario) -> th.Tensor:
+    out = th.zeros(len(observations), observation_size(largest))
+    for name, part in layout(scenario).items():
+        start = layout(largest)[name].start
+        out[:, start : start + part.stop - part.start] = observations[:, part]
+    return out
+
+
 def test_a_body_that_is_not_there_changes_nothing() -> None:
     """As ``MixedVecEnv`` pads: zeros in the place of a fourth pursuer and of two obstacles."""
     scenario, largest = Scenario(obstacles=0), Scenario(pursuers=4, obstacles=2)
     observations, _ = observed(scenario)
-    padded = th.zeros(len(observations), largest.pursuers * 4 + 8 + 4)
-    for name, part in layout(scenario).items():
-        start = layout(largest)[name].start
-        padded[:, start : start + part.stop - part.start] = observations[:, part]
     features = features_of(scenario, observations, SetFeatures)
-    assert th.allclose(features_of(largest, padded, SetFeatures), features, atol=1e-6)
+    assert th.allclose(features_of(largest, padded(observations, scenario, largest), SetFeatures), features, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -141,3 +145,14 @@ def test_weights_of_sets_serve_any_number_of_bodies() -> None:
         actions, _ = fit_policy(policy, in_setting).predict(observations.numpy())
         assert actions.shape == (scenario.pursuers, 2)
         assert len(np.unique(actions, axis=0)) == scenario.pursuers
+
+
+def test_a_policy_acts_for_fewer_bodies_as_where_the_others_are_not_there() -> None:
+    config = load_config(fields={"pursuers": 5, "obstacles": 2}, overrides=("algorithm.features=set",))
+    policy = build_policy(config)
+    fewer = config.in_setting(config.cell.setting._replace(pursuers=3, obstacles=1))
+    observations, _ = observed(fewer.scenario)
+    in_all_slots = np.zeros((5, observation_size(config.scenario)), np.float32)
+    in_all_slots[:3] = padded(observations, fewer.scenario, config.scenario)
+    actions, _ = fit_policy(policy, fewer).predict(observations.numpy())
+    np.testing.assert_allclose(actions, policy.predict(in_all_slots)[0][:3], atol=1e-6)

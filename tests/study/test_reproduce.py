@@ -101,7 +101,8 @@ def test_one_policy_fills_the_cells_of_several_settings(tmp_path: Path, monkeypa
         rows = [row for row in csv.DictReader(file) if row["method"] == "ours" and row["result"] == "run"]
     assert [row["pursuers"] for row in rows] == ["2", "3", "5"]
     assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
-    assert verify(load_grid(str(grid)), tmp_path).rounds == 3 * len(run.episodes)
+    verified = verify(load_grid(str(grid)), tmp_path)
+    assert verified.equal == verified.rounds == 3 * len(run.episodes)
 
     grid.write_text(ELSEWHERE.partition("elsewhere")[0])  # what has been played elsewhere is not asked for any more
     reproduce(str(grid), tmp_path, 1)
