@@ -44,13 +44,17 @@ class RelativeFeatures(BaseFeaturesExtractor):
         return th.cat([*parts.values(), *seen], dim=1)
 
 
+RATIO_SCALE = 10.0
+"""A target is a few tenths faster than its pursuers: what it is faster, times this, is as large as other inputs."""
+
+
 class SetFeatures(BaseFeaturesExtractor):
     """The other pursuers and the obstacles as sets: weights for any number of them, in whichever order.
 
     A small network reads each body: its offset and direction as seen from the pursuer and from the target, with the
     target's from the pursuer and the pursuer's velocity. Of what it makes of the bodies of a kind, the actors and the
-    critics read the greatest and the mean of each value, beside what the observation says of the pursuer, the target
-    and the extras. A body whose offset is zero is not there, as ``MixedVecEnv`` has it.
+    critics read the greatest and the mean of each value and how many there are, beside what the observation says of the
+    pursuer, the target and the extras. A body whose offset is zero is not there, as ``MixedVecEnv`` has it.
 
     :param observation_space: of a pursuer
     :param scenario: whose observations these are
@@ -71,19 +75,22 @@ class SetFeatures(BaseFeaturesExtractor):
         """
         parts = {name: observations[:, part] for name, part in self.parts.items()}
         velocity, target = parts["velocity"][:, None], parts["target"][:, None]
+        if "speed_ratio" in parts:
+            parts["speed_ratio"] = RATIO_SCALE * (parts["speed_ratio"] - 1)
         own = [part for name, part in parts.items() if not name.startswith(("pursuer", "obstacle"))]
         pooled = []
         for kind, embed in self.embed.items():
             offsets = _pairs(parts[kind])
             if not offsets.shape[1]:
-                pooled += [observations.new_zeros(len(observations), SET_SIZE)] * 2
+                pooled.append(observations.new_zeros(len(observations), 2 * SET_SIZE + 1))
                 continue
             seen = offsets, offsets - target, target.expand_as(offsets)
             directions = [_direction(each, self.softening) for each in seen]
             values = embed(th.cat([*seen, *directions, velocity.expand_as(offsets)], dim=2))
             there = (offsets != 0).any(dim=2, keepdim=True)
             values = values * there
-            pooled += [values.amax(1), values.sum(1) / there.sum(1).clamp(min=1)]
+            number = there.sum(1)
+            pooled += [values.amax(1), values.sum(1) / number.clamp(min=1), number]
         return th.cat([*own, *pooled], dim=1)
 
 

@@ -41,5 +41,5 @@ def features_size(scenario: Scenario, features: Features) -> int:
     size = observation_size(scenario)
     others = scenario.pursuers - 1 + scenario.units
     if features == "set":
-        return int(size - (4 if scenario.observe_directions else 2) * others + 4 * SET_SIZE)
+        return int(size - (4 if scenario.observe_directions else 2) * others + 2 * (2 * SET_SIZE + 1))
     return int(size + (4 * others if features == "relative" else 0))

@@ -90,6 +90,29 @@ def test_a_set_says_where_each_body_is() -> None:
         assert not th.allclose(features_of(scenario, moved, SetFeatures), features, atol=1e-4), name
 
 
+def test_a_set_says_how_many_bodies_there_are() -> None:
+    """Two obstacles in one place have the greatest and the mean of one of them."""
+    one, two = Scenario(obstacles=1), Scenario(obstacles=2)
+    observations, _ = observed(one)
+    twice = padded(observations, one, two)
+    for name in ("obstacles", "obstacle_directions"):
+        twice[:, layout(two)[name]] = observations[:, layout(one)[name]].repeat(1, 2)
+    alone, together = features_of(one, observations, SetFeatures), features_of(two, twice, SetFeatures)
+    assert th.allclose(together[:, :-1], alone[:, :-1], atol=1e-6)
+    assert (alone[:, -1].tolist(), together[:, -1].tolist()) == ([1.0] * 3, [2.0] * 3)
+
+
+def test_sets_read_how_much_faster_the_target_is_in_tenths_of_the_pursuers_speed() -> None:
+    ratios = th.tensor([1.1, 1.4])
+    scenario = Scenario(speed_ratio=1.4, observe_extras=("speed_ratio",))
+    observations = observed(scenario)[0][:2].clone()
+    where = layout(scenario)["speed_ratio"]
+    observations[:, where] = ratios[:, None]
+    features = features_of(scenario, observations, SetFeatures)
+    assert th.isclose(features[0], th.tensor(1.0), atol=1e-5).any()
+    assert th.isclose(features[1], th.tensor(4.0), atol=1e-5).any()
+
+
 def padded(observations: th.Tensor, scenario: Scenario, largest: Scenario) -> th.Tensor:
     out = th.zeros(len(observations), observation_size(largest))
     for name, part in layout(scenario).items():
