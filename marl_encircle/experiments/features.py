@@ -1,15 +1,13 @@
 """What the networks read in place of the bare observation."""
 
-from itertools import pairwise
-
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch import nn
+from torch.nn import functional
 
 from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.experiments.sizes import BODY_SIZE, SET_SIZE, features_size
+from marl_encircle.experiments.sizes import BODY_SIZE, NEAREST, features_size
 
 
 class RelativeFeatures(BaseFeaturesExtractor):
@@ -51,10 +49,10 @@ RATIO_SCALE = 10.0
 class SetFeatures(BaseFeaturesExtractor):
     """The other pursuers and the obstacles as sets: weights for any number of them, in whichever order.
 
-    A small network reads each body: its offset and direction as seen from the pursuer and from the target, with the
-    target's from the pursuer and the pursuer's velocity. Of what it makes of the bodies of a kind, the actors and the
-    critics read the greatest and the mean of each value and how many there are, beside what the observation says of the
-    pursuer, the target and the extras. A body whose offset is zero is not there, as ``MixedVecEnv`` has it.
+    Of each kind those that are nearest to the target, the nearest first, as many as ``NEAREST`` says, and zeros where
+    there are fewer; each by its offset r and its direction r / (norm(r) + softening), as seen from the pursuer and from
+    the target. Before them what the observation says of the pursuer, the target and the extras. A body whose offset is
+    zero is not there, as ``MixedVecEnv`` has it.
 
     :param observation_space: of a pursuer
     :param scenario: whose observations these are
@@ -64,9 +62,6 @@ class SetFeatures(BaseFeaturesExtractor):
         super().__init__(observation_space, features_size(scenario, "set"))
         self.parts = layout(scenario)
         self.softening = scenario.direction_softening
-        self.embed = nn.ModuleDict(
-            {kind: _perceptron(BODY_SIZE, SET_SIZE, SET_SIZE) for kind in ("pursuers", "obstacles")}
-        )
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features, shape (B, features).
@@ -74,30 +69,24 @@ class SetFeatures(BaseFeaturesExtractor):
         :param observations: shape (B, O)
         """
         parts = {name: observations[:, part] for name, part in self.parts.items()}
-        velocity, target = parts["velocity"][:, None], parts["target"][:, None]
         if "speed_ratio" in parts:
             parts["speed_ratio"] = RATIO_SCALE * (parts["speed_ratio"] - 1)
         own = [part for name, part in parts.items() if not name.startswith(("pursuer", "obstacle"))]
-        pooled = []
-        for kind, embed in self.embed.items():
-            offsets = _pairs(parts[kind])
-            if not offsets.shape[1]:
-                pooled.append(observations.new_zeros(len(observations), 2 * SET_SIZE + 1))
-                continue
-            seen = offsets, offsets - target, target.expand_as(offsets)
-            directions = [_direction(each, self.softening) for each in seen]
-            values = embed(th.cat([*seen, *directions, velocity.expand_as(offsets)], dim=2))
-            there = (offsets != 0).any(dim=2, keepdim=True)
-            values = values * there
-            number = there.sum(1)
-            pooled += [values.amax(1), values.sum(1) / number.clamp(min=1), number]
-        return th.cat([*own, *pooled], dim=1)
+        sets = [self._nearest(_pairs(parts[kind]), parts["target"][:, None], most) for kind, most in NEAREST.items()]
+        return th.cat([*own, *sets], dim=1)
 
+    def _nearest(self, offsets: th.Tensor, target: th.Tensor, most: int) -> th.Tensor:
+        """Return what is seen of the nearest bodies of a kind, shape (B, most * BODY_SIZE).
 
-def _perceptron(*sizes: int) -> nn.Sequential:
-    """Return layers of these sizes, each with a ReLU after it, so that zero is the least that they give."""
-    layers = [(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(sizes)]
-    return nn.Sequential(*(module for layer in layers for module in layer))
+        :param offsets: from the pursuer, shape (B, K, 2)
+        :param target: its offset from the pursuer, shape (B, 1, 2)
+        """
+        there = (offsets != 0).any(dim=2)
+        both = offsets, offsets - target
+        seen = th.cat([*both, *(_direction(each, self.softening) for each in both)], dim=2) * there[..., None]
+        distance = both[1].norm(dim=2).masked_fill(~there, th.inf)
+        nearest = _in_order(seen, distance.argsort(dim=1)[:, :most]).flatten(1)
+        return functional.pad(nearest, (0, most * BODY_SIZE - nearest.shape[1]))
 
 
 def _direction(offsets: th.Tensor, softening: float) -> th.Tensor:
@@ -114,4 +103,4 @@ def _pairs(part: th.Tensor) -> th.Tensor:
 
 def _in_order(rows: th.Tensor, order: th.Tensor) -> th.Tensor:
     """Return the rows (B, K, 2) of each world in its order, (B, K)."""
-    return rows.gather(1, order[..., None].expand_as(rows))
+    return rows.gather(1, order[..., None].expand(-1, -1, rows.shape[2]))

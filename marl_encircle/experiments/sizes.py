@@ -6,24 +6,23 @@ from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments.sections import AlgorithmConfig, Features
 
-SET_SIZE = 32
-"""Of what the features ``set`` make of each body."""
+NEAREST = {"pursuers": 4, "obstacles": 3}
+"""How many bodies of each kind the features ``set`` show."""
 
-BODY_SIZE = 14
-"""Of what they read of it."""
+BODY_SIZE = 8
+"""Of what they show of each."""
 
 
 def count_weights(scenario: Scenario, algorithm: AlgorithmConfig) -> dict[str, int]:
     """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
-    n, hidden, sets = scenario.pursuers, algorithm.net_arch, algorithm.features == "set"
+    n, hidden = scenario.pursuers, algorithm.net_arch
     size = features_size(scenario, algorithm.features)
     actor, joint = weights_between([size, *hidden, 2]), n * (size + 2)
-    bodies = 2 * weights_between([BODY_SIZE, SET_SIZE, SET_SIZE]) if sets else 0
     if algorithm.critic == "shared":
         critics = weights_between([joint, *hidden, n])
     else:
         critics = n * weights_between([joint, *hidden, 1])
-    return {"actors": (1 if sets else n) * actor + bodies, "critics": critics + bodies}
+    return {"actors": actor if algorithm.features == "set" else n * actor, "critics": critics}
 
 
 def weights_between(sizes: list[int]) -> int:
@@ -41,5 +40,5 @@ def features_size(scenario: Scenario, features: Features) -> int:
     size = observation_size(scenario)
     others = scenario.pursuers - 1 + scenario.units
     if features == "set":
-        return int(size - (4 if scenario.observe_directions else 2) * others + 2 * (2 * SET_SIZE + 1))
+        return int(size - (4 if scenario.observe_directions else 2) * others + BODY_SIZE * sum(NEAREST.values()))
     return int(size + (4 * others if features == "relative" else 0))
