@@ -23,7 +23,7 @@ def test_config_show_prints_terms_and_weights_and_every_section(run: Run) -> Non
     for section in ("scenario", "algorithm", "training", "evaluation", "learning_rate", "safety_distance"):
         assert section in out
     assert "overall_angle" not in out
-    assert "methods: ma2019, model_a, model_b, model_c, ours, ours_plus" in out
+    assert "methods: generalist, ma2019, model_a, model_b, model_c, ours, ours_plus" in out
 
 
 def test_config_show_prints_keys_that_a_record_leaves_out(run: Run) -> None:

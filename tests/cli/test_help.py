@@ -182,7 +182,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     [
         ("train --reward m", ["ma2019", "model_a", "model_b", "model_c"]),
         ("train --scenario ", ["centre", "default", "paper"]),
-        ("train --algorithm ", ["maddpg", "matd3", "matd3_relative"]),
+        ("train --algorithm ", ["maddpg", "matd3", "matd3_relative", "matd3_set"]),
         ("train --scene t", ["tunnel"]),
         ("train --engine n", ["native"]),
         ("watch o", ["ours", "ours_plus"]),

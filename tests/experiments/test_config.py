@@ -262,7 +262,7 @@ def test_the_methods_are_those_of_the_notes() -> None:
         "model_c": (both, True, terms - {"contributing_angle"}),
         "ma2019": (pursuers, False, {"encirclement_radius", "phase_difference", "collision", "completion", "time"}),
     }
-    assert sorted([*expected, "ours_plus"]) == reward_names()
+    assert sorted([*expected, "ours_plus", "generalist"]) == reward_names()
     assert difference(load_config().to_dict(), load_config("ours_plus").to_dict()) == [
         "reward.name: ours here, ours_plus there",
         "reward.terms.obstacle_angle: 0.5 here, 2.0 there",

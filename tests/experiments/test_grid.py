@@ -27,11 +27,13 @@ def test_the_smoke_grid_is_two_tiny_cells() -> None:
     assert load_grid("smoke") == Grid((Job("ours", ONE, 900, "smoke"), Job("ma2019", ONE, 900, "smoke")), {})
 
 
-def test_the_committed_grid_has_every_cell_of_the_study_and_its_first_seeds() -> None:
+def test_the_committed_grid_has_the_cells_of_the_study_but_one_and_their_first_seeds() -> None:
     committed, study = load_grid("committed"), load_grid("all")
-    assert committed.cells == study.cells
-    assert (committed.frozen, committed.elsewhere, committed.aliases) == (study.frozen, study.elsewhere, study.aliases)
-    assert committed.jobs == study.jobs[: len(committed.jobs)]
+    (missing,) = study.cells - committed.cells
+    assert missing.method == "generalist"
+    assert (committed.frozen, committed.aliases) == (study.frozen, study.aliases)
+    assert committed.elsewhere == {cell: others for cell, others in study.elsewhere.items() if cell != missing}
+    assert committed.jobs == tuple(job for job in study.jobs if job.seed == 0 and job.config.cell != missing)
 
 
 def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
@@ -55,6 +57,17 @@ def test_what_goes_beyond_the_paper_has_the_settings_seeds_and_rounds_of_the_stu
             ours.evaluation,
             ours.training.curriculum,
         )
+
+
+def test_one_policy_is_trained_and_played_in_the_settings_of_the_study() -> None:
+    grid = load_grid("all")
+    (job,) = (job for job in grid.jobs if job.reward == "generalist")
+    settings = {job.setting for job in grid.jobs if job.reward == "ours"}
+    assert set(job.config.settings) == settings
+    unseen = {Setting(1.1, 3, 5), Setting(1.1, 7, 1)}
+    assert set(grid.elsewhere[job.config.cell]) == settings | unseen
+    plus, ours = load_config("ours_plus").reward, job.config.reward
+    assert ours.model_copy(update={"name": plus.name}) == plus
 
 
 def test_without_obstacles_model_a_has_the_runs_of_ours() -> None:
@@ -98,7 +111,7 @@ def test_a_grid_may_say_what_was_amended_since(tmp_path: Path) -> None:
 def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> None:
     text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: 1}, {scene: tunnel, obstacles: 2}]\n"
     assert grid_of(tmp_path, text).elsewhere == {OURS: (ONE._replace(scene="concave"),)}
-    study = load_grid("all").elsewhere
+    study = {cell: others for cell, others in load_grid("all").elsewhere.items() if cell.method != "generalist"}
     assert {cell.setting.obstacles for cell in study} == {1}
     assert {len(others) for others in study.values()} == {2}
 
@@ -182,7 +195,7 @@ def test_no_cell_has_rounds_of_two_trainings(tmp_path: Path, text: str, pursuers
 
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
     grid = load_grid("all")
-    assert len(grid.cells) == 54
+    assert len(grid.cells) == 55
     assert Cell("model_a", Setting(1.1, 3, 0)) in grid.cells
 
 

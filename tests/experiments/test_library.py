@@ -23,7 +23,7 @@ def refused(name: str) -> str:
 
 
 def test_the_installation_knows_the_papers_methods_and_the_algorithms() -> None:
-    assert reward_names() == ["ma2019", "model_a", "model_b", "model_c", "ours", "ours_plus"]
+    assert reward_names() == ["generalist", "ma2019", "model_a", "model_b", "model_c", "ours", "ours_plus"]
     assert load_section("algorithm", "matd3")["name"] == "matd3"
 
 
