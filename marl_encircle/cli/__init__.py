@@ -52,7 +52,7 @@ ONE, MANY, STUDY, ABOUT = "One run", "Many runs", "What runs show", "Settings an
 RUN = "results/runs/ours/ratio1.1_n3_m1_random/seed0"
 
 _add("train", runs.train_command, ONE, "--pursuers 3 --obstacles 1", "--reward model_b --set training.n_worlds=32")
-_add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --episodes 1000 --seed 77 --json")
+_add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --scene tunnel", f"{RUN} --episodes 1000 --seed 77 --json")
 _add("watch", watching.watch, ONE, "ours --pursuers 3 --obstacles 1", "ours --versus model_b --save round.gif")
 _add("export", runs.export, ONE, RUN, f"{RUN} --to torchscript --out pursuers.pt --json")
 _add(

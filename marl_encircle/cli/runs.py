@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from marl_encircle.cli.completion import scenes
 from marl_encircle.cli.options import (
     OUTPUT,
+    SETTING,
     Algorithm,
     AsJson,
     Engine,
@@ -127,17 +129,52 @@ def evaluate(
         int | None,
         typer.Option(min=0, metavar="SEED", help="Evaluation seed.", show_default="that of the run's configuration"),
     ] = None,
+    speed_ratio: Annotated[
+        float | None,
+        typer.Option(
+            metavar="LAMBDA",
+            rich_help_panel=SETTING,
+            help="Target speed / pursuer speed to play at.",
+            show_default="the run's",
+        ),
+    ] = None,
+    pursuers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", rich_help_panel=SETTING, help="Number of pursuers to play with.", show_default="the run's"
+        ),
+    ] = None,
+    obstacles: Annotated[
+        int | None,
+        typer.Option(
+            metavar="M", rich_help_panel=SETTING, help="Number of obstacles to play with.", show_default="the run's"
+        ),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENE",
+            autocompletion=scenes,
+            rich_help_panel=SETTING,
+            help="Play in this scene: random, concave or tunnel.",
+            show_default="the run's",
+        ),
+    ] = None,
     write: Annotated[
         bool,
         typer.Option(
             "--write",
             rich_help_panel=OUTPUT,
-            help="Replace the episodes.csv of a finished run; only with the default rounds.",
+            help="Replace the episodes.csv of a finished run; only with the default rounds and setting.",
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Play rounds with a trained policy, noise off, and print how they ended."""
+    """Play rounds with a trained policy, noise off, and print how they ended.
+
+    It plays in the run's own setting unless told otherwise. Any policy plays at other speed ratios and in other scenes,
+    with other numbers of pursuers and obstacles only those whose features are sets.
+    """
     from marl_encircle.experiments.build import load_run
     from marl_encircle.experiments.evaluate import play_rounds
     from marl_encircle.experiments.metrics import summarise_run
@@ -154,18 +191,19 @@ def evaluate(
     if write and (episodes, seed) != own_rounds:
         flags = f"--episodes {own_rounds[0]} --seed {own_rounds[1]}"
         raise ConfigError(f"--write needs the rounds of the run's configuration: {flags}")
+    given: dict[str, Any] = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
+    trained = config.cell.setting
+    setting = trained._replace(**{name: value for name, value in given.items() if value is not None})
+    if write and setting != trained:
+        raise ConfigError("--write needs the setting of the run's configuration")
     if record["status"] == "diverged":
         typer.echo("warning: this run diverged; its policy is the last one of its training", err=True)
-    rounds = play_rounds(policy, config, episodes, seed)
+    rounds = play_rounds(policy, config, episodes, seed, setting)
     closure = config.reward.closure
     own = summarise_run(rounds, closure)
-    scenario = config.scenario
     result = {
         "method": config.reward.name,
-        "speed_ratio": scenario.speed_ratio,
-        "pursuers": scenario.pursuers,
-        "obstacles": scenario.obstacles,
-        "scene": scenario.scene,
+        **setting._asdict(),
         "train_seed": record["seed"],
         "eval_seed": seed,
         "episodes": episodes,

@@ -85,6 +85,21 @@ class Config(Section):
         scenario = build_scenario({**fields_of(self.scenario), **setting._asdict()})
         return self.model_copy(update={"scenario": scenario})
 
+    def to_play_in(self, setting: Setting) -> "Config":
+        """Return the configuration in another setting, in which its trained policies can play.
+
+        :raises ConfigError: if the scenario does not allow it, or has other bodies than their networks can read
+        """
+        config = self.in_setting(setting)
+        here, there = self.scenario, config.scenario
+        same = (here.pursuers, here.units) == (there.pursuers, there.units)
+        if not same and self.algorithm.features != "set":
+            raise ConfigError(
+                f"policies of {self.reward.name} cannot play with other numbers of bodies than they were trained with; "
+                "that needs algorithm.features set"
+            )
+        return config
+
     @property
     def settings(self) -> list[Setting]:
         """The settings that are trained in, as many worlds in each."""

@@ -29,11 +29,11 @@ def play_rounds(
 
     :param episodes: number of rounds
     :param seed: evaluation seed; world r is seeded with ``world_seeds(seed, episodes)[r]``
-    :param setting: where to play; by default where the policy was trained. Other numbers of bodies need the features
-        ``set``
+    :param setting: where to play; by default where the policy was trained
+    :raises ConfigError: for a setting in which it cannot play: other numbers of bodies need the features ``set``
     """
     if setting not in (None, config.cell.setting):
-        trained, config = config.scenario, config.in_setting(setting)
+        trained, config = config.scenario, config.to_play_in(setting)
         if (trained.pursuers, trained.units) != (config.scenario.pursuers, config.scenario.units):
             policy = fit_policy(policy, config)
     scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)

@@ -252,18 +252,11 @@ def _check_distinct(played: Mapping[Cell, Iterable[Setting]]) -> None:
 
 
 def _check_playable(job: Job, other: Setting) -> None:
-    """Refuse a setting whose scenario is not allowed, or has other bodies than a job's networks can read."""
-    config = job.config
+    """Refuse a setting in which a job's policies cannot play."""
     try:
-        there, here = config.in_setting(other).scenario, config.scenario
+        job.config.to_play_in(other)
     except ConfigError as error:
         raise ConfigError(f"elsewhere: {error}") from error
-    same = (there.pursuers, there.units) == (here.pursuers, here.units)
-    if not same and config.algorithm.features != "set":
-        raise ConfigError(
-            f"elsewhere: policies of {job.reward} cannot play with other numbers of bodies than they were trained "
-            "with; that needs algorithm.features set"
-        )
 
 
 def _in_words(setting: Setting) -> str:

@@ -30,8 +30,11 @@ from marl_encircle.cli import kinds, machine
 from marl_encircle.experiments import executors, export, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
+from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import load_config
-from marl_encircle.experiments.metrics import wilson_interval
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.metrics import summarise_run, wilson_interval
+from marl_encircle.experiments.records import Setting
 
 Run = Callable[..., Done]
 
@@ -256,6 +259,23 @@ def test_evaluate_plays_the_runs_own_rounds_unless_told_otherwise(run: Run) -> N
     assert done == run("evaluate", finished(), "--episodes", "8", "--seed", "1000", "--json")
     result = json.loads(done.out)
     assert (result["episodes"], result["eval_seed"], done.err) == (8, 1000, "")
+
+
+def test_evaluate_plays_in_another_setting_where_the_policy_can(run: Run) -> None:
+    elsewhere = ("--speed-ratio", "1.05", "--scene", "concave")
+    done = run("evaluate", finished(), *elsewhere, "--json")
+    result = json.loads(done.out)
+    assert [result[key] for key in KEYS[1:5]] == [1.05, 3, 1, "concave"]
+    policy, config, _ = load_run(finished())
+    rounds = play_rounds(policy, config, 8, 1000, Setting(1.05, 3, 1, "concave"))
+    assert result["sigma_c"] == summarise_run(rounds, "all").sigma_c
+    for option in (("--pursuers", "4"), ("--obstacles", "2")):
+        done = run("evaluate", finished(), *option)
+        assert (done.code, done.out) == (2, "")
+        assert "policies of ours cannot play with other numbers of bodies" in done.err
+    done = run("evaluate", finished(), *elsewhere, "--write")
+    assert (done.code, done.out) == (2, "")
+    assert "--write needs the setting of the run's configuration" in done.err
 
 
 def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, runs: Path) -> None:
