@@ -4,8 +4,9 @@ Commands import what they need when they run: help and completion wait for no to
 configuration.
 """
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -23,6 +24,18 @@ Profile = Literal["full", "smoke"]
 Engine = Literal["native", "supersuit"]
 ExecutorName = Literal["local", "ray"]
 
+
+def setting_option(metavar: str, text: str, default: str, autocompletion: Callable[[], list[str]] | None = None) -> Any:
+    """Return an option that says a part of the setting.
+
+    :param text: its help
+    :param default: what the help says is taken where it is not given
+    """
+    return typer.Option(
+        metavar=metavar, rich_help_panel=SETTING, help=text, show_default=default, autocompletion=autocompletion
+    )
+
+
 RewardOption = Annotated[
     str, typer.Option(metavar="METHOD", autocompletion=names_of("reward"), help="A method's name, or a YAML file.")
 ]
@@ -35,42 +48,15 @@ ScenarioOption = Annotated[
         help="The world's rules: default (those of paper, the study's), centre, or a YAML file.",
     ),
 ]
-# Those that are not given are the scenario's own.
 SpeedRatio = Annotated[
-    float | None,
-    typer.Option(
-        metavar="LAMBDA",
-        rich_help_panel=SETTING,
-        help="Target speed / pursuer speed.",
-        show_default="the scenario's; 1.1 in default",
-    ),
+    float | None, setting_option("LAMBDA", "Target speed / pursuer speed.", "the scenario's; 1.1 in default")
 ]
-Pursuers = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        rich_help_panel=SETTING,
-        help="Number of pursuers.",
-        show_default="the scenario's; 3 in default",
-    ),
-]
-Obstacles = Annotated[
-    int | None,
-    typer.Option(
-        metavar="M",
-        rich_help_panel=SETTING,
-        help="Number of obstacles.",
-        show_default="the scenario's; 1 in default",
-    ),
-]
+Pursuers = Annotated[int | None, setting_option("N", "Number of pursuers.", "the scenario's; 3 in default")]
+Obstacles = Annotated[int | None, setting_option("M", "Number of obstacles.", "the scenario's; 1 in default")]
 Scene = Annotated[
     str | None,
-    typer.Option(
-        metavar="SCENE",
-        autocompletion=scenes,
-        rich_help_panel=SETTING,
-        help="What an obstacle looks like: random, concave or tunnel.",
-        show_default="the scenario's; random in default",
+    setting_option(
+        "SCENE", "What an obstacle looks like: random, concave or tunnel.", "the scenario's; random in default", scenes
     ),
 ]
 Algorithm = Annotated[

@@ -9,7 +9,6 @@ import typer
 from marl_encircle.cli.completion import scenes
 from marl_encircle.cli.options import (
     OUTPUT,
-    SETTING,
     Algorithm,
     AsJson,
     Engine,
@@ -24,6 +23,7 @@ from marl_encircle.cli.options import (
     Set,
     SpeedRatio,
     read_config,
+    setting_option,
 )
 from marl_encircle.cli.printing import print_pairs
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -130,35 +130,12 @@ def evaluate(
         typer.Option(min=0, metavar="SEED", help="Evaluation seed.", show_default="that of the run's configuration"),
     ] = None,
     speed_ratio: Annotated[
-        float | None,
-        typer.Option(
-            metavar="LAMBDA",
-            rich_help_panel=SETTING,
-            help="Target speed / pursuer speed to play at.",
-            show_default="the run's",
-        ),
+        float | None, setting_option("LAMBDA", "Target speed / pursuer speed to play at.", "the run's")
     ] = None,
-    pursuers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", rich_help_panel=SETTING, help="Number of pursuers to play with.", show_default="the run's"
-        ),
-    ] = None,
-    obstacles: Annotated[
-        int | None,
-        typer.Option(
-            metavar="M", rich_help_panel=SETTING, help="Number of obstacles to play with.", show_default="the run's"
-        ),
-    ] = None,
+    pursuers: Annotated[int | None, setting_option("N", "Number of pursuers to play with.", "the run's")] = None,
+    obstacles: Annotated[int | None, setting_option("M", "Number of obstacles to play with.", "the run's")] = None,
     scene: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENE",
-            autocompletion=scenes,
-            rich_help_panel=SETTING,
-            help="Play in this scene: random, concave or tunnel.",
-            show_default="the run's",
-        ),
+        str | None, setting_option("SCENE", "Play in this scene: random, concave or tunnel.", "the run's", scenes)
     ] = None,
     write: Annotated[
         bool,

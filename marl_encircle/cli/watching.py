@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from marl_encircle.cli.completion import names_of, scenes
-from marl_encircle.cli.options import SETTING
+from marl_encircle.cli.options import setting_option
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.spelling import nearest
 
@@ -46,31 +46,12 @@ def watch(
         ),
     ] = None,
     speed_ratio: Annotated[
-        float | None,
-        typer.Option(
-            metavar="LAMBDA",
-            rich_help_panel=SETTING,
-            help="Target speed / pursuer speed of the run.",
-            show_default="1.1",
-        ),
+        float | None, setting_option("LAMBDA", "Target speed / pursuer speed of the run.", "1.1")
     ] = None,
-    pursuers: Annotated[
-        int | None,
-        typer.Option(metavar="N", rich_help_panel=SETTING, help="Number of pursuers of the run.", show_default="3"),
-    ] = None,
-    obstacles: Annotated[
-        int | None,
-        typer.Option(metavar="M", rich_help_panel=SETTING, help="Number of obstacles of the run.", show_default="1"),
-    ] = None,
+    pursuers: Annotated[int | None, setting_option("N", "Number of pursuers of the run.", "3")] = None,
+    obstacles: Annotated[int | None, setting_option("M", "Number of obstacles of the run.", "1")] = None,
     scene: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENE",
-            autocompletion=scenes,
-            rich_help_panel=SETTING,
-            help="Play in this scene: random, concave or tunnel.",
-            show_default="the run's",
-        ),
+        str | None, setting_option("SCENE", "Play in this scene: random, concave or tunnel.", "the run's", scenes)
     ] = None,
     seed: Annotated[
         int | None,

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from marl_encircle.experiments.metrics import CONFIDENCE, Difference, success_difference
+from marl_encircle.experiments.metrics import CONFIDENCE, Difference
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.cells import CellRuns, result_of
-from marl_encircle.study.differences import nothing_to_compare
+from marl_encircle.study.differences import paired_success
 from marl_encircle.study.paper import LABELS, TABLE_METHODS, PaperResult, label
 from marl_encircle.study.typeset import DASH, Styled, Table, Text, markdown, setting_columns, to_csv, with_interval
 
@@ -128,7 +128,7 @@ def pairs_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) -
         for methods in combinations(reversed(TABLE_METHODS), 2):
             first, second = (Cell(method, setting) for method in methods)
             difference = _papers_difference(paper.get(first), paper.get(second))
-            ours = _difference(runs.get(first), runs.get(second))
+            ours = paired_success(runs.get(first), runs.get(second))
             if difference is not None and ours is not None:
                 yield Pair(first, second, difference, ours)
 
@@ -177,15 +177,6 @@ def _papers_difference(first: PaperResult | None, second: PaperResult | None) ->
     shares = (first.success_percent / 100, second.success_percent / 100)
     error = math.sqrt(sum(share * (1 - share) for share in shares) / PAPER_ROUNDS)
     return difference if abs(difference) > 100 * stats.norm.ppf(0.5 + CONFIDENCE / 2) * error else None
-
-
-def _difference(first: CellRuns | None, second: CellRuns | None) -> Difference | None:
-    """Return the paired difference of two cells, each under its own closure rule; None without one."""
-    if first is None or second is None or first.closure is None or second.closure is None:
-        return None
-    if nothing_to_compare(first, second) is not None:
-        return None
-    return success_difference(first.finished, second.finished, first.closure, second.closure)
 
 
 def _means(values: list[float]) -> tuple[str, str]:

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable, Mapping
 
-from marl_encircle.experiments.metrics import Difference, success_difference
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import CellRuns, Result, gather, result_of
-from marl_encircle.study.differences import nothing_to_compare
+from marl_encircle.study.differences import paired_success
 from marl_encircle.study.paper import label, rank
 from marl_encircle.study.paper_layout import notes_on, success_and_length
 from marl_encircle.study.tables import record_of
@@ -54,16 +53,7 @@ def render_amendment(
 def _row(before: Result, after: Result) -> list[Text]:
     """Write a cell's results in Markdown."""
     method, setting = before.cell
-    difference = _difference(before.runs, after.runs)
+    difference = paired_success(after.runs, before.runs)
     shown = "".join(with_interval(difference, 100, "+.1f")) if difference else ""
     places = [f"{value:g}" for value in setting[:3]]
     return [label(method), *places, success_and_length(before), success_and_length(after), shown]
-
-
-def _difference(before: CellRuns | None, after: CellRuns | None) -> Difference | None:
-    """Return the paired difference in S under the method's own rule; None where nothing can be compared."""
-    if before is None or after is None or before.closure is None or after.closure is None:
-        return None
-    if nothing_to_compare(before, after) is not None:
-        return None
-    return success_difference(after.finished, before.finished, after.closure, before.closure)

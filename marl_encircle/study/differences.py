@@ -71,11 +71,7 @@ def _success(result: Result) -> float:
 
 def _is_higher(first: Result, second: Result) -> bool:
     """Whether the paired difference in S, each under its rule, has an interval above zero."""
-    if first.runs is None or second.runs is None or first.closure is None or second.closure is None:
-        return False
-    if nothing_to_compare(first.runs, second.runs) is not None:
-        return False
-    difference = metrics.success_difference(first.runs.finished, second.runs.finished, first.closure, second.closure)
+    difference = paired_success(first.runs, second.runs)
     return difference is not None and difference.verdict == "higher"
 
 
@@ -96,6 +92,15 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
         success = metrics.success_difference(ours.finished, other.finished, *closures)
         length = metrics.length_difference(ours.finished, other.finished, *closures)
         yield _Row(cell, *closures, success, length, None)
+
+
+def paired_success(first: CellRuns | None, second: CellRuns | None) -> Difference | None:
+    """Return S of the first minus S of the second, each under its own closure rule; None where nothing is common."""
+    if first is None or second is None or first.closure is None or second.closure is None:
+        return None
+    if nothing_to_compare(first, second) is not None:
+        return None
+    return metrics.success_difference(first.finished, second.finished, first.closure, second.closure)
 
 
 def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:
