@@ -225,19 +225,19 @@ def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MA
     :param what: a method's name, for its first training seed in a setting; a run folder or the ``policy.safetensors``
         in one; or, if it is ``trusted``, a zip-file that ``MADDPG.save`` wrote, from which only the actors are taken
     :param trusted: read a zip-file, **which can run code when it is loaded**
-    :param fields: ``speed_ratio``, ``pursuers``, ``obstacles`` and ``scene`` of a name's setting; 1.1, 3, 1 and random
-        where they are not given
+    :param fields: ``speed_ratio``, ``pursuers``, ``obstacles`` and ``scene`` of a name's setting, 1.1, 3, 1 and random
+        where they are not given; or those in which the policy of a run folder shall play, if it serves any setting
     :raises ConfigError: for a name or a setting without a policy, with those that there are and the nearest
     :raises DamagedFileError: if a file is missing, changed, does not fit the configuration, or is not trusted
     """
-    wanted: dict[str, Any] = {}
+    setting = setting_of(fields)
+    wanted = {name: value for name, value in setting._asdict().items() if name in fields}
     if isinstance(what, str) and not is_run_path(what):
-        setting = setting_of(fields)
         what, wanted = find_run(what, setting, [pretrained_runs()]), setting._asdict()
-    elif fields:
-        raise ConfigError(f"{what}: has a setting of its own; {', '.join(fields)} can only be given with a name")
     path = Path(what)
     if trusted and path.is_file() and zipfile.is_zipfile(path):
+        if fields:
+            raise ConfigError(f"{what}: a zip-file has a setting of its own; got {', '.join(fields)}")
         try:
             return load_actors(path)
         except Exception as error:  # unpickling raises whatever it likes

@@ -10,9 +10,9 @@ import pytest
 from made_up import episode, write_run
 from tiny_runs import IN_SEVERAL_SETTINGS, finished, tiny
 
-from marl_encircle import files
+from marl_encircle import MADDPG, files
 from marl_encircle.experiments import build, pretrained
-from marl_encircle.experiments.build import load_policy, policy_bytes
+from marl_encircle.experiments.build import load_policy, make_vec_env, policy_bytes
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run, first_run, pretrained_runs, setting_of
 from marl_encircle.experiments.records import Cell, Setting, read_record, run_path
 from marl_encircle.experiments.sizes import observation_size
@@ -151,9 +151,19 @@ def test_what_is_not_there_is_told_with_what_is(
         assert reason in str(caught.value)
 
 
-def test_a_run_folder_has_its_own_setting() -> None:
-    with pytest.raises(ConfigError, match="has a setting of its own; pursuers can only be given with a name"):
-        load_policy(finished(), pursuers=3)
+def test_a_run_folder_has_its_own_setting_unless_its_policy_serves_any(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"was trained with 3 pursuers and 1 obstacle.*; asked for with 4 pursuers"):
+        load_policy(finished(), pursuers=4)
+    with pytest.raises(ConfigError, match="pursuer: unknown key; did you mean pursuers"):
+        load_policy(finished(), pursuer=4)
+    folder, _ = train(tiny(overrides=IN_SEVERAL_SETTINGS), 3, out=tmp_path)
+    assert load_policy(folder, pursuers=4).agents == replace(tiny().scenario, pursuers=4).agents
+
+
+def test_a_zip_file_has_its_own_setting(tmp_path: Path) -> None:
+    MADDPG("MlpPolicy", make_vec_env(n_worlds=2, seed=0)).save(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match=r"model\.zip: a zip-file has a setting of its own; got pursuers"):
+        load_policy(tmp_path / "model.zip", trusted=True, pursuers=3)
 
 
 def test_a_setting_differs_from_the_usual_one_by_what_is_named() -> None:
