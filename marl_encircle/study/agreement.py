@@ -128,7 +128,7 @@ def pairs_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) -
         for methods in combinations(reversed(TABLE_METHODS), 2):
             first, second = (Cell(method, setting) for method in methods)
             difference = _papers_difference(paper.get(first), paper.get(second))
-            ours = paired_success(runs.get(first), runs.get(second))
+            ours = paired_success(*(result_of(cell, runs.get(cell)) for cell in (first, second)))
             if difference is not None and ours is not None:
                 yield Pair(first, second, difference, ours)
 

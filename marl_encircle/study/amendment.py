@@ -53,7 +53,7 @@ def render_amendment(
 def _row(before: Result, after: Result) -> list[Text]:
     """Write a cell's results in Markdown."""
     method, setting = before.cell
-    difference = paired_success(after.runs, before.runs)
+    difference = paired_success(after, before)
     shown = "".join(with_interval(difference, 100, "+.1f")) if difference else ""
     places = [f"{value:g}" for value in setting[:3]]
     return [label(method), *places, success_and_length(before), success_and_length(after), shown]

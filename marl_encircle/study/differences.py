@@ -71,7 +71,7 @@ def _success(result: Result) -> float:
 
 def _is_higher(first: Result, second: Result) -> bool:
     """Whether the paired difference in S, each under its rule, has an interval above zero."""
-    difference = paired_success(first.runs, second.runs)
+    difference = paired_success(first, second)
     return difference is not None and difference.verdict == "higher"
 
 
@@ -94,13 +94,13 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
         yield _Row(cell, *closures, success, length, None)
 
 
-def paired_success(first: CellRuns | None, second: CellRuns | None) -> Difference | None:
-    """Return S of the first minus S of the second, each under its own closure rule; None where nothing is common."""
-    if first is None or second is None or first.closure is None or second.closure is None:
+def paired_success(first: Result, second: Result) -> Difference | None:
+    """Return S of the first minus S of the second, each under its result's rule; None where nothing is common."""
+    if first.runs is None or second.runs is None or first.closure is None or second.closure is None:
         return None
-    if nothing_to_compare(first, second) is not None:
+    if nothing_to_compare(first.runs, second.runs) is not None:
         return None
-    return metrics.success_difference(first.finished, second.finished, first.closure, second.closure)
+    return metrics.success_difference(first.runs.finished, second.runs.finished, first.closure, second.closure)
 
 
 def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:

@@ -58,7 +58,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
     assert found["algorithm.features"] == ["observation", "relative"]
     found = json.loads(run("config", "diff", "committed", "smoke", "--json").out)
     assert found["profile"] == ["full", "smoke"]
-    assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[0], [900]]
+    assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[0, 1, 2, 3, 4], [900]]
     found = json.loads(run("config", "diff", "full", "smoke", "--json").out)
     assert {key.split(".")[0] for key in found} == {"training", "evaluation"}
     done = run("config", "diff", "ours", mine)
