@@ -184,7 +184,7 @@ ALLOWED = {
     "experiments/tensorboard.py": ["SummaryWriter", "mkdir", "symlink_to", "unlink"],  # what TensorBoard shows
     "experiments/trials.py": ["dump"],  # to a text
     "replays/film.py": ["get_writer", "save", "save"],  # to a path of `atomic_path`, to bytes
-    "study/figures/canvas.py": ["savefig"],  # to bytes
+    "study/figures/canvas.py": ["save", "savefig"],  # to bytes
     "study/reproduce.py": ["unlink"],  # a table that there is no run for any more
 }
 

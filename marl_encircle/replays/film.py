@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from marl_encircle import files
 from marl_encircle.envs.palette import LINE
@@ -17,11 +18,6 @@ from marl_encircle.envs.view import Layers
 from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match
-
-try:
-    from PIL import Image
-except ImportError as error:
-    raise ImportError("pictures need Pillow: pip install 'marl-encircle[render]'") from error
 
 Picture = NDArray[np.uint8]
 

@@ -1,6 +1,7 @@
 """Figures show what the records say, in the same bytes wherever and whenever they are drawn."""
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -18,6 +19,7 @@ from made_up import episode, rounds
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Arc
+from PIL import Image
 from tiny_runs import TINY, finished
 
 from marl_encircle import files
@@ -120,6 +122,18 @@ def test_files_name_neither_the_day_nor_the_program() -> None:
         assert encoded[suffix].startswith(start)
     for name in (b"dc:date", b"dc:creator", b"CreationDate", b"/Creator", b"/Producer", b"Software", b"matplotlib.org"):
         assert not any(name in data for data in encoded.values()), name
+
+
+def test_a_picture_with_a_palette_looks_as_drawn() -> None:
+    """It is held against Matplotlib's own picture, which has all colours."""
+    figure, whole = figure4(), io.BytesIO()
+    with canvas.style():
+        figure.savefig(whole, format="png", dpi=300)
+    small = Image.open(io.BytesIO(encode(figure, ["png"])["png"]))
+    assert small.mode == "P"
+    difference = np.abs(np.asarray(small.convert("RGB"), float) - np.asarray(Image.open(whole).convert("RGB"), float))
+    assert difference.mean() < 0.5
+    assert (difference.max(axis=2) > 12).mean() < 0.005
 
 
 def test_the_users_settings_are_neither_used_nor_changed() -> None:
