@@ -24,13 +24,18 @@ Changes = Mapping[str, Any]
 
 
 class Protocol(Section):
-    """A protocol file."""
+    """A protocol file.
+
+    :param seeds: training seeds
+    :param evaluation_seed: of the rounds that judge the scenarios, which are not the study's
+    """
 
     reward: str
     profile: Profile
     scenario: str
     settings: Annotated[list[SettingConfig], Field(min_length=1)]
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=1 << 32)]], Field(min_length=1)]
+    evaluation_seed: Annotated[int, Field(ge=0, lt=1 << 63)]
     neighbours: list[Annotated[dict[str, Any], Field(min_length=1, max_length=1)]]
     combinations: Annotated[int, Field(ge=0, le=MAX_SCENARIOS)]
 
@@ -112,7 +117,10 @@ def jobs_of(protocol: Protocol, changes: Changes) -> list[Job]:
             seed,
             protocol.profile,
             protocol.scenario,
-            overrides=tuple(f"scenario.{field}={value}" for field, value in changes.items()),
+            overrides=(
+                f"evaluation.seed={protocol.evaluation_seed}",
+                *(f"scenario.{field}={value}" for field, value in changes.items()),
+            ),
         )
         for cell in protocol.cells
         for seed in protocol.seeds

@@ -313,8 +313,8 @@ def test_a_bad_grid_is_refused_by_key_and_reason(tmp_path: Path, old: str, new: 
 
 
 def test_a_seed_of_the_evaluation_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"grid\.yaml: seed must differ from evaluation\.seed: .*; got 1000"):
-        grid_of(tmp_path, GRID.format(method="ours").replace("[2, 3, 2]", "[2, 1000]"))
+    with pytest.raises(ConfigError, match=r"grid\.yaml: seed must differ from evaluation\.seed: .*; got 4000"):
+        grid_of(tmp_path, GRID.format(method="ours").replace("[2, 3, 2]", "[2, 4000]"))
 
 
 def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def test_bodies_that_cannot_be_placed_are_told_before_anything_is_written(
 @pytest.mark.parametrize(
     ("overrides", "seed", "engine", "reason"),
     [
-        ([], 1000, "native", r"seed must differ from evaluation\.seed"),
+        ([], 4000, "native", r"seed must differ from evaluation\.seed"),
         ([], 2000, "native", r"seed must differ from evaluation\.curve_seed"),
         ([], -1, "native", "seed must be an integer"),
         ([], 0, "nativ", "did you mean native?"),

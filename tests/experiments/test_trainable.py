@@ -81,7 +81,7 @@ def test_a_training_without_learning_is_refused(profile: Any, pursuers: int) -> 
 @pytest.mark.parametrize(
     ("seed", "reason"),
     [
-        (1000, r"seed must differ from evaluation\.seed: the training would see the evaluation's rounds; got 1000"),
+        (4000, r"seed must differ from evaluation\.seed: the training would see the evaluation's rounds; got 4000"),
         (2000, r"seed must differ from evaluation\.curve_seed: .*; got 2000"),
         (-1, "seed must be an integer from 0 to 4294967295; got -1"),
         (1 << 32, "seed must be an integer from 0 to 4294967295; got 4294967296"),
@@ -94,7 +94,7 @@ def test_a_training_seed_is_none_of_the_evaluations(seed: Any, reason: str) -> N
     with pytest.raises(ConfigError, match=reason):
         check_seed(load_config(), seed)
     check_seed(load_config(), 999)
-    check_seed(load_config(overrides=["evaluation.seed=3"]), 1000)
+    check_seed(load_config(overrides=["evaluation.seed=3"]), 4000)
 
 
 def test_the_memory_that_is_needed_is_that_of_the_arrays() -> None:

@@ -170,7 +170,7 @@ def test_rounds_are_fresh_unless_asked_for_and_it_is_said() -> None:
     assert fresh_seed((side(),)) not in used
     crowded = config.model_copy(update={"evaluation": config.evaluation.model_copy(update={"seed": 7000})})
     assert fresh_seed((replace(side(), config=crowded, train_seed=7001),)) == 7002
-    seeds = {None: "fresh ones; the reported ones are --seed 1000", 1000: "the reported ones", 0: "a training seed"}
+    seeds = {None: "fresh ones; the reported ones are --seed 4000", 4000: "the reported ones", 0: "a training seed"}
     for seed, said in seeds.items():
         assert said in list(Match(side(), eval_seed=seed).notes())[-1]
 

@@ -27,6 +27,7 @@ scenario: centre
 settings:
   - {speed_ratio: 1.1, pursuers: 3, obstacles: 0}
 seeds: [910]
+evaluation_seed: 1000
 neighbours:
   - {acceleration: 3}
   - {contacts: hard}
