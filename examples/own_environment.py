@@ -9,8 +9,7 @@ import sys
 from mpe2 import simple_spread_v3
 from stable_baselines3.common.vec_env import VecMonitor
 
-from marl_encircle import MADDPG
-from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
+from marl_encircle import MADDPG, SuperSuitVecEnv
 
 total_timesteps = int(sys.argv[1]) if sys.argv[1:] else 600_000
 

@@ -14,16 +14,28 @@ if TYPE_CHECKING:
     from marl_encircle.core.scenario import Scenario
     from marl_encircle.envs import encirclement_v0
     from marl_encircle.envs.encirclement_v0 import parallel_env
+    from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
     from marl_encircle.experiments.build import load_policy, make_vec_env
     from marl_encircle.maddpg import MADDPG, MATD3
 
-__all__ = ["MADDPG", "MATD3", "Reward", "Scenario", "encirclement_v0", "load_policy", "make_vec_env", "parallel_env"]
+__all__ = [
+    "MADDPG",
+    "MATD3",
+    "Reward",
+    "Scenario",
+    "SuperSuitVecEnv",
+    "encirclement_v0",
+    "load_policy",
+    "make_vec_env",
+    "parallel_env",
+]
 
 _HOMES = {
     "MADDPG": "maddpg",
     "MATD3": "maddpg",
     "Reward": "core.rewards",
     "Scenario": "core.scenario",
+    "SuperSuitVecEnv": "envs.supersuit_vec_env",
     "encirclement_v0": "envs.encirclement_v0",
     "load_policy": "experiments.build",
     "make_vec_env": "experiments.build",

@@ -113,7 +113,7 @@ class MADDPG(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> None:
         if hasattr(env, "possible_agents") and not isinstance(env, VecEnv):
-            raise ValueError("a PettingZoo environment learns as a VecEnv: SuperSuitVecEnv(lambda: env, n_worlds=...)")
+            raise ValueError("a PettingZoo environment learns as a VecEnv: SuperSuitVecEnv(env, n_worlds=...)")
         if kwargs.pop("use_sde", False):
             raise ValueError("use_sde is not for deterministic actors: see exploration_noise and action_noise")
         super().__init__(
