@@ -16,7 +16,7 @@ from pettingzoo.utils.conversions import parallel_to_aec, parallel_to_aec_wrappe
 
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.core.simulator import Difficulty
+from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.spelling import nearest
 
@@ -112,7 +112,7 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         self.state_space = _state_space(scenario)
 
     @property
-    def simulator(self) -> Any:
+    def simulator(self) -> Simulator:
         """The simulator of this one world."""
         return self._arena.simulator
 

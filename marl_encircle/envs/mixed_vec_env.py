@@ -48,7 +48,8 @@ class MixedVecEnv(SlotVecEnv):
         each, rest = divmod(n_worlds, len(scenarios))
         if rest or not each:
             raise ValueError(f"n_worlds must be a multiple of the {len(scenarios)} settings; got {n_worlds}")
-        self.scenario, self.n_worlds, self.n_agents = largest, n_worlds, largest.pursuers
+        self.scenario, self.reward = largest, reward
+        self.n_worlds, self.n_agents = n_worlds, largest.pursuers
         self.agents = list(largest.agents)
         self.render_mode = None
         self._parts = [

@@ -38,12 +38,12 @@ class EncirclementVecEnv(SlotVecEnv):
         seed: int | None = None,
     ) -> None:
         self.scenario = scenario or Scenario()
-        self.terms = reward or Reward()
+        self.reward = reward or Reward()
         self.n_worlds, self.n_agents = n_worlds, self.scenario.pursuers
         self.agents = list(self.scenario.agents)
         self.render_mode = None
         self._running = False
-        self._arena = Arena(self.scenario, self.terms, n_worlds)
+        self._arena = Arena(self.scenario, self.reward, n_worlds)
         self.simulator, self.rounds = self._arena.simulator, self._arena.rounds
         super().__init__(
             num_envs=n_worlds * self.n_agents,
