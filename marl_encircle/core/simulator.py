@@ -55,8 +55,11 @@ class Difficulty(TypedDict, total=False):
     obstacle_radius: float
 
 
-def world_seeds(seed: int, n: int) -> list[int]:
-    """Return the seeds of n worlds, the same for the first worlds whatever n is: 63-bit integers."""
+def world_seeds(seed: int | None, n: int) -> list[int]:
+    """Return the seeds of n worlds, the same for the first worlds whatever n is: 63-bit integers.
+
+    :param seed: None takes fresh entropy from the system
+    """
     words = np.random.SeedSequence(seed).generate_state(n, np.uint64) >> np.uint64(1)
     return [int(word) for word in words]
 
@@ -104,9 +107,7 @@ class Simulator:
 
         :param seed: one seed for all (world b gets ``world_seeds(seed, B)[b]``), or one for each world
         """
-        if seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
-        seeds = world_seeds(int(seed), self.n_worlds) if isinstance(seed, int | np.integer) else list(seed)
+        seeds = list(seed) if isinstance(seed, Sequence) else world_seeds(seed, self.n_worlds)
         if len(seeds) != self.n_worlds:
             raise ValueError(f"{self.n_worlds} worlds need {self.n_worlds} seeds; got {len(seeds)}")
         self._streams = [np.random.default_rng(s) for s in seeds]

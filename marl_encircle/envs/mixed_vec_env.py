@@ -65,8 +65,7 @@ class MixedVecEnv(SlotVecEnv):
 
         :return: the seed of each slot's world
         """
-        entropy = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
-        seeds = [part.env.seed(s) for part, s in zip(self._parts, world_seeds(entropy, len(self._parts)), strict=True)]
+        seeds = [part.env.seed(s) for part, s in zip(self._parts, world_seeds(seed, len(self._parts)), strict=True)]
         by_world = [s for part, own in zip(self._parts, seeds, strict=True) for s in own[:: part.env.n_agents]]
         self._seeds = [s for s in by_world for _ in range(self.n_agents)]
         return self._seeds

@@ -5,7 +5,6 @@ time limits as true ends, lets the infos of a reset overwrite those of the last 
 with SuperSuit 3.11.0, is named where it is worked around and has a test in ``tests/envs/test_supersuit_vec_env.py``.
 """
 
-import secrets
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from typing import Any, TypeAlias
@@ -64,8 +63,7 @@ class SuperSuitVecEnv(VecEnv):
         :return: the seed of each slot's world (B*N)
         """
         # ConcatVecEnv seeds world b with s + b: runs with seeds 7 and 8 would share all worlds but one.
-        seeds = world_seeds(secrets.randbits(64) if seed is None else seed, self.n_worlds)
-        self._seeds = [world_seed for world_seed in seeds for _ in self.agents]
+        self._seeds = [world_seed for world_seed in world_seeds(seed, self.n_worlds) for _ in self.agents]
         return self._seeds
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:

@@ -58,8 +58,7 @@ class EncirclementVecEnv(SlotVecEnv):
 
         :return: the seed of each slot's world
         """
-        entropy = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
-        self._seeds = [s for s in world_seeds(entropy, self.n_worlds) for _ in range(self.n_agents)]
+        self._seeds = [s for s in world_seeds(seed, self.n_worlds) for _ in range(self.n_agents)]
         return self._seeds
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
