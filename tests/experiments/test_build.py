@@ -99,7 +99,7 @@ def test_a_users_file_and_overrides_reach_the_worlds(tmp_path: Path) -> None:
     path.write_text("base: ours\nterms: {time: 3.0, contraction: null}\n")
     for given in (path, str(path)):
         venv = make_vec_env(given, 2, overrides=["reward.scale=0.5"], max_cycles=7)
-        reward = venv.get_attr("terms")[0]
+        reward = venv.get_attr("reward")[0]
         assert (reward.scale, reward.terms["time"], venv.get_attr("scenario")[0].max_cycles) == (0.5, 3.0, 7)
         assert "contraction" not in reward.active
 
