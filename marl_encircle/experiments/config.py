@@ -103,7 +103,7 @@ class Config(Section):
     @property
     def settings(self) -> list[Setting]:
         """The settings that are trained in, as many worlds in each."""
-        return [Setting(**setting.model_dump()) for setting in self.training.settings] or [self.cell.setting]
+        return [setting.build() for setting in self.training.settings] or [self.cell.setting]
 
 
 def load_config(

@@ -149,7 +149,7 @@ def load_grid(name: str) -> Grid:
     aliases: dict[Cell, Cell] = {}
     for group in grid.groups:
         for method in map(beside, group.methods):
-            for setting in (Setting(**column.model_dump()) for column in group.settings):
+            for setting in (column.build() for column in group.settings):
                 names = beside(grid.scenario), beside(group.algorithm)
                 first = Job(method, setting, 0, grid.profile, *names, tuple(group.overrides))
                 with naming_file(path):
@@ -168,7 +168,7 @@ def load_grid(name: str) -> Grid:
                 with naming_file(path):
                     _check_same(earlier, first)
                 jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
-                others = (Setting(**other.model_dump()) for other in group.elsewhere)
+                others = (other.build() for other in group.elsewhere)
                 asked.setdefault(cell, {}).update(dict.fromkeys(others))
     for cell, shared in aliases.items():
         if shared not in owners:
@@ -260,7 +260,7 @@ def _check_playable(job: Job, other: Setting) -> None:
 
 
 def _in_words(setting: Setting) -> str:
-    return f"ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
+    return f"{setting.symbols}, {setting.scene}"
 
 
 def _owner(cell: Cell, shared: list[Shared]) -> str | None:

@@ -41,7 +41,7 @@ def setting_of(fields: Mapping[str, Any]) -> Setting:
     :raises ConfigError: for an unknown field or scene, naming the nearest, and for a value of another type
     """
     try:
-        setting = Setting(**SettingConfig(**{**USUAL_SETTING._asdict(), **fields}).model_dump())
+        setting = SettingConfig(**{**USUAL_SETTING._asdict(), **fields}).build()
     except ValidationError as error:
         raise ConfigError("\n".join(explain(error, SettingConfig))) from error
     if setting.scene not in SCENES:

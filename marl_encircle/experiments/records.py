@@ -75,6 +75,16 @@ class Setting(NamedTuple):
     obstacles: int
     scene: str = "random"
 
+    @property
+    def numbers(self) -> tuple[str, str, str]:
+        """Speed ratio, pursuers and obstacles as they stand in tables."""
+        return f"{self.speed_ratio:g}", str(self.pursuers), str(self.obstacles)
+
+    @property
+    def symbols(self) -> str:
+        """The same on one line: ``ratio 1.1, n=3, m=1``."""
+        return "ratio {}, n={}, m={}".format(*self.numbers)
+
 
 class Cell(NamedTuple):
     """One method in one setting."""

@@ -15,7 +15,6 @@ from marl_encircle.experiments.config import Config, Profile
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file, is_path
-from marl_encircle.experiments.records import Setting
 from marl_encircle.experiments.sections import Section, SettingConfig
 from marl_encircle.experiments.trainable import check_seed, check_training, memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
@@ -154,7 +153,7 @@ class Space(NamedTuple):
         f = self.file
         changes = [f"{key}={json.dumps(value)}" for key, value in values.items()]
         overrides = (*f.overrides, *NO_REPORTED_ROUNDS, *changes)
-        setting = Setting(**f.setting.model_dump())
+        setting = f.setting.build()
         return [Job(f.reward, setting, seed, f.profile, f.scenario, f.algorithm, overrides) for seed in f.seeds]
 
     @property

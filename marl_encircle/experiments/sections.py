@@ -16,7 +16,7 @@ from pydantic import (
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.rewards import Reward
-from marl_encircle.experiments.records import MAX_ROUNDS
+from marl_encircle.experiments.records import MAX_ROUNDS, Setting
 
 Features = Literal["observation", "relative", "set"]
 Count = Annotated[int, Field(ge=1, le=10**10)]
@@ -82,6 +82,10 @@ class SettingConfig(Section):
     pursuers: int
     obstacles: int
     scene: str = "random"
+
+    def build(self) -> Setting:
+        """Return the setting."""
+        return Setting(**self.model_dump())
 
 
 class RewardConfig(Section):

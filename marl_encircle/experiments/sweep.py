@@ -14,7 +14,7 @@ from marl_encircle import files, locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import MAX_FILE
+from marl_encircle.experiments.records import MAX_FILE, run_path
 from marl_encircle.experiments.train import ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 
@@ -138,9 +138,8 @@ def sweep(
 
 
 def name_of(job: Job) -> str:
-    """Return a short name: method, setting and seed."""
-    s = job.setting
-    return f"{job.reward} ratio{s.speed_ratio:g}_n{s.pursuers}_m{s.obstacles}_{s.scene} seed{job.seed}"
+    """Return the run folder below the folder of runs."""
+    return run_path(job.config.cell, job.seed).as_posix()
 
 
 def _train(

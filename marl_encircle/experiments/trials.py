@@ -93,7 +93,7 @@ def _best_values(space: Space, best: Row, out: Path) -> dict[str, dict[str, Any]
 
 
 def _as_yaml(space: Space, best: Row, values: dict[str, Any]) -> str:
-    s, seeds = space.file.setting, ", ".join(map(str, space.file.seeds))
+    seeds = ", ".join(map(str, space.file.seeds))
     out = io.StringIO()
     yaml = YAML()
     yaml.representer.add_representer(
@@ -102,6 +102,6 @@ def _as_yaml(space: Space, best: Row, values: dict[str, Any]) -> str:
     yaml.dump(values, out)
     head = (
         f"Trial {best.number} of a search: success {best.success:.4f}, the mean of the last {space.file.last_points}",
-        f"points of tuning seeds {seeds}; ratio {s.speed_ratio:g}, n={s.pursuers}, m={s.obstacles}.",
+        f"points of tuning seeds {seeds}; {space.file.setting.build().symbols}.",
     )
     return "".join(f"# {line}\n" for line in head) + out.getvalue()

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from marl_encircle.experiments.metrics import CONFIDENCE, Difference
-from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.records import Cell
 from marl_encircle.study.cells import CellRuns, result_of
 from marl_encircle.study.differences import paired_success
 from marl_encircle.study.paper import LABELS, TABLE_METHODS, PaperResult, label
@@ -155,7 +155,7 @@ def order_table(pairs: Iterable[Pair]) -> Table:
     pairs = list(pairs)
     rows: list[list[Text]] = [
         [
-            *_places(pair.first.setting),
+            *pair.first.setting.numbers,
             f"{label(pair.first.method)} - {label(pair.second.method)}",
             Styled(f"{pair.paper:+.1f}", "italic"),
             "".join(with_interval(pair.ours, 100, "+.1f")),
@@ -184,7 +184,3 @@ def _means(values: list[float]) -> tuple[str, str]:
     if not values:
         return DASH, DASH
     return f"{np.abs(values).mean():.2f}", f"{np.mean(values):+.2f}"
-
-
-def _places(setting: Setting) -> list[Text]:
-    return [f"{value:g}" for value in setting[:3]]

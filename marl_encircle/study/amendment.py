@@ -55,5 +55,4 @@ def _row(before: Result, after: Result) -> list[Text]:
     method, setting = before.cell
     difference = paired_success(after, before)
     shown = "".join(with_interval(difference, 100, "+.1f")) if difference else ""
-    places = [f"{value:g}" for value in setting[:3]]
-    return [label(method), *places, success_and_length(before), success_and_length(after), shown]
+    return [label(method), *setting.numbers, success_and_length(before), success_and_length(after), shown]

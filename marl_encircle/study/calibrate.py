@@ -96,7 +96,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
     cells, chosen = protocol.cells, calibration.chosen.changes
     rows = [(name_of(trial.changes), trial.results, f"{trial.distance:.2f}") for trial in calibration.trials]
     rows.append(("the paper", tuple(paper_cells()[cell] for cell in cells), ""))
-    columns = [f"ratio {s.speed_ratio:g}, n={s.pursuers}, m={s.obstacles}" for _, s in cells]
+    columns = [cell.setting.symbols for cell in cells]
     header = ["Scenario", *(f"S % / MEL at {column}" for column in columns), "Distance"]
     seeds = ", ".join(map(str, protocol.seeds))
     notes = [

@@ -105,7 +105,4 @@ def result_of(cell: Cell, runs: CellRuns | None, closure: Closure | None = None)
 
 
 def _in_words(cell: Cell) -> str:
-    setting = cell.setting
-    return (
-        f"{cell.method} at ratio {setting.speed_ratio:g}, n={setting.pursuers}, m={setting.obstacles}, {setting.scene}"
-    )
+    return f"{cell.method} at {cell.setting.symbols}, {cell.setting.scene}"

@@ -121,7 +121,7 @@ def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str |
 
 def _shown(row: _Row) -> list[str]:
     """Write a row in Markdown."""
-    cells = [label(row.cell.method), *(f"{value:g}" for value in row.cell.setting[:3])]
+    cells = [label(row.cell.method), *row.cell.setting.numbers]
     if row.success is None:
         return [*cells, "", row.nothing or "", "", ""]
     return [

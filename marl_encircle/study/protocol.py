@@ -42,7 +42,7 @@ class Protocol(Section):
     @property
     def cells(self) -> list[Cell]:
         """The cells of the paper that the scenarios are held against."""
-        return [Cell(self.reward, Setting(**setting.model_dump())) for setting in self.settings]
+        return [Cell(self.reward, setting.build()) for setting in self.settings]
 
 
 class Result(NamedTuple):

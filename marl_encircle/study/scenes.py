@@ -38,7 +38,7 @@ def render_scenes(runs: Iterable[Run], notes: Sequence[str] = ()) -> dict[str, s
     for method, setting in sorted(trained, key=lambda cell: (rank(cell.method), cell)):
         cells = [Cell(method, setting._replace(scene=scene)) for scene in scenes]
         shown = [success_and_length(results[cell]) if cell in results else "" for cell in cells]
-        rows.append([label(method), *(f"{value:g}" for value in setting[:3]), *shown])
+        rows.append([label(method), *setting.numbers, *shown])
     texts = (
         markdown(_TITLE, ["Method", "λ", "n", "m", *scenes], rows, [*_NOTES, *notes_on(results.values()), *notes]),
         to_csv([record_of(result, None) for result in results.values()]),

@@ -200,7 +200,7 @@ def _other_table(results: Sequence[Result], more: Sequence[str]) -> Table:
     rows = [
         [
             label(result.cell.method) + (f" (runs of {label(owner)})" if (owner := _owner(result)) else ""),
-            *(f"{value:g}" for value in result.cell.setting[:3]),
+            *result.cell.setting.numbers,
             result.cell.setting.scene,
             success_and_length(result),
             seeds_of(result),

@@ -488,7 +488,7 @@ def test_sweep_counts_and_names_what_failed(run: Run, runs: Path, tmp_path: Path
     done = run("sweep", grid(tmp_path, [0, 7]), "--out", runs, "--json")
     assert done.code == 1
     assert json.loads(done.out) == {"done": 1, "running": 0, "failed": 1, "diverged": 0, "left": 0}
-    assert "failed: ours ratio1.1_n3_m1_random seed7" in done.err
+    assert "failed: ours/ratio1.1_n3_m1_random/seed7" in done.err
     again = run("sweep", grid(tmp_path, [0]), "--out", runs, "--json")
     assert again.code == 0
     assert json.loads(again.out) == {"done": 1, "running": 0, "failed": 0, "diverged": 0, "left": 0}
@@ -555,7 +555,7 @@ def test_reproduce_tables_fails_if_a_run_does_and_still_renders(run: Run, tmp_pa
     done = run("reproduce-tables", "--grid", grid(tmp_path, [0, 7]), "--out", tmp_path / "results")
     assert done.code == 1
     assert done.out.splitlines()[-1] == "trained=1 evaluated=0 reused=0"
-    assert "failed: ours ratio1.1_n3_m1_random seed7" in done.err
+    assert "failed: ours/ratio1.1_n3_m1_random/seed7" in done.err
 
 
 @pytest.mark.parametrize("name", ["sweep", "tables", "reproduce-tables"])

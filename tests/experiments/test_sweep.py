@@ -83,7 +83,7 @@ def test_a_failed_run_is_counted_and_named_and_the_others_go_on(
     made_up_worker(monkeypatch, "seed == 1 and sys.exit(1)\n" + finish())
     progress = sweep(JOBS, tmp_path, 1)
     assert counts(progress) == (2, 0, 0, 1, 0, 0)
-    assert progress.failed == [name_of(JOBS[1])] == ["ours ratio1.1_n3_m1_random seed1"]
+    assert progress.failed == [name_of(JOBS[1])] == ["ours/ratio1.1_n3_m1_random/seed1"]
     made_up_worker(monkeypatch, finish())
     assert counts(sweep(JOBS, tmp_path, 1)) == (3, 2, 0, 0, 0, 0)
 
