@@ -76,22 +76,18 @@ def render_tables(
     :return: file name -> text
     :raises ValueError: when a cell has a duplicate training seed or its runs have different closure rules
     """
-    by_cell = gather(with_settings_elsewhere(runs), aliases or {})
-    reported = paper_results()
-    cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
-    others = _by_method(by_cell.keys() - set(cells))
+    shown = _gather(runs, aliases or {}, asked)
     rendered: dict[str, str] = {}
-    for name, paper in reported.items():
-        results = [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)]
+    for name, results in shown.main.items():
+        paper = shown.paper[name]
         rendered |= _texts(_main_table(name, results, paper, notes))
         rendered[f"{name}.csv"] = to_csv([record_of(result, paper.get(result.cell)) for result in results])
-    rendered |= _common_table(cells, by_cell, reported, notes)
-    if others:
-        results = [result_of(cell, by_cell[cell]) for cell in others]
-        other = _other_table(results, notes)
+    rendered |= _common_table(shown.cells, shown.runs, shown.paper, notes)
+    if shown.other:
+        other = _other_table(shown.other, notes)
         rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
-        rendered["table_other.csv"] = to_csv([record_of(result, None) for result in results])
-    return rendered | render_differences(cells, by_cell, notes)
+        rendered["table_other.csv"] = to_csv([record_of(result, None) for result in shown.other])
+    return rendered | render_differences(shown.cells, shown.runs, notes)
 
 
 def render_table1(options: Mapping[str, MethodOptions], notes: Sequence[str] = ()) -> dict[str, str]:
@@ -122,17 +118,38 @@ def main_tables(
 
     What is in them is what :func:`render_tables` writes, whose parameters these are.
     """
-    by_cell = gather(with_settings_elsewhere(runs), aliases)
-    reported = paper_results()
-    cells = _ordered({cell for table in reported.values() for cell in table}, {*by_cell, *asked})
-    others = _by_method(by_cell.keys() - set(cells))
-    tables = [
-        _main_table(name, [result_of(cell, by_cell.get(cell)) for cell in _ordered(paper, cells)], paper, notes)
-        for name, paper in reported.items()
-    ]
-    if others:
-        tables.append(_other_table([result_of(cell, by_cell[cell]) for cell in others], notes))
-    return [*tables, difference_table(cells, by_cell, notes)]
+    shown = _gather(runs, aliases, asked)
+    tables = [_main_table(name, results, shown.paper[name], notes) for name, results in shown.main.items()]
+    if shown.other:
+        tables.append(_other_table(shown.other, notes))
+    return [*tables, difference_table(shown.cells, shown.runs, notes)]
+
+
+class _Shown(NamedTuple):
+    """What the tables show.
+
+    :param runs: the runs of each cell
+    :param paper: what the paper reports, by table
+    :param cells: all cells in the paper's settings, in the order of the rows
+    :param main: those of each of the paper's tables, under each method's own closure rule
+    :param other: cells of other settings
+    """
+
+    runs: dict[Cell, CellRuns]
+    paper: dict[str, dict[Cell, PaperResult]]
+    cells: list[Cell]
+    main: dict[str, list[Result]]
+    other: list[Result]
+
+
+def _gather(runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[Cell]) -> _Shown:
+    by_cell, paper = gather(with_settings_elsewhere(runs), aliases), paper_results()
+    cells = _ordered({cell for table in paper.values() for cell in table}, {*by_cell, *asked})
+    main = {
+        name: [result_of(cell, by_cell.get(cell)) for cell in _ordered(table, cells)] for name, table in paper.items()
+    }
+    other = [result_of(cell, by_cell[cell]) for cell in _by_method(by_cell.keys() - set(cells))]
+    return _Shown(by_cell, paper, cells, main, other)
 
 
 def _texts(table: Table) -> dict[str, str]:
