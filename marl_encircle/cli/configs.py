@@ -48,7 +48,17 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Print a resolved configuration; the reward as a table of terms and weights."""
-    config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
+    config = read_config(
+        reward,
+        algorithm=algorithm,
+        scenario=scenario,
+        profile=profile,
+        overrides=overrides,
+        speed_ratio=speed_ratio,
+        pursuers=pursuers,
+        obstacles=obstacles,
+        scene=scene,
+    )
     if as_json:
         typer.echo(json.dumps(config.to_dict(), indent=2))
         return

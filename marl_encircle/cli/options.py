@@ -103,26 +103,33 @@ Address = Annotated[
 
 def read_config(
     reward: str,
-    speed_ratio: float | None,
-    pursuers: int | None,
-    obstacles: int | None,
-    scene: str | None,
-    scenario: str,
+    *,
     algorithm: str,
+    scenario: str,
     profile: Profile,
     overrides: list[str] | None,
+    **setting: float | str | None,
 ) -> "Config":
     """Return the configuration that the options describe.
 
+    :param setting: its parts; None where an option was not given
     :raises ConfigError: if it is wrong
     """
     from marl_encircle.experiments.config import load_config
 
-    given = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
-    fields = {name: value for name, value in given.items() if value is not None}
     return load_config(
-        reward, algorithm=algorithm, profile=profile, scenario=scenario, fields=fields, overrides=overrides or ()
+        reward,
+        algorithm=algorithm,
+        profile=profile,
+        scenario=scenario,
+        fields=given(**setting),
+        overrides=overrides or (),
     )
+
+
+def given(**options: Any) -> dict[str, Any]:
+    """Return the options that were given, those that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def make_executor(name: ExecutorName, address: str | None) -> "Executor":

@@ -22,6 +22,7 @@ from marl_encircle.cli.options import (
     Scene,
     Set,
     SpeedRatio,
+    given,
     read_config,
     setting_option,
 )
@@ -64,7 +65,17 @@ def train_command(
     as_json: AsJson = False,
 ) -> None:
     """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped."""
-    config = read_config(reward, speed_ratio, pursuers, obstacles, scene, scenario, algorithm, profile, overrides)
+    config = read_config(
+        reward,
+        algorithm=algorithm,
+        scenario=scenario,
+        profile=profile,
+        overrides=overrides,
+        speed_ratio=speed_ratio,
+        pursuers=pursuers,
+        obstacles=obstacles,
+        scene=scene,
+    )
     from marl_encircle.experiments.records import read_record
     from marl_encircle.experiments.train import train
 
@@ -168,9 +179,8 @@ def evaluate(
     if write and (episodes, seed) != own_rounds:
         flags = f"--episodes {own_rounds[0]} --seed {own_rounds[1]}"
         raise ConfigError(f"--write needs the rounds of the run's configuration: {flags}")
-    given: dict[str, Any] = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles, "scene": scene}
     trained = config.cell.setting
-    setting = trained._replace(**{name: value for name, value in given.items() if value is not None})
+    setting = trained._replace(**given(speed_ratio=speed_ratio, pursuers=pursuers, obstacles=obstacles, scene=scene))
     if write and setting != trained:
         raise ConfigError("--write needs the setting of the run's configuration")
     if record["status"] == "diverged":

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from marl_encircle.cli.completion import names_of, scenes
-from marl_encircle.cli.options import setting_option
+from marl_encircle.cli.options import given, setting_option
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.spelling import nearest
 
@@ -89,8 +89,7 @@ def watch(
         raise ConfigError(str(error)) from error
     if save is not None:
         film.check_film(save)
-    given = {"speed_ratio": speed_ratio, "pursuers": pursuers, "obstacles": obstacles}
-    fields = {name: value for name, value in given.items() if value is not None}
+    fields = given(speed_ratio=speed_ratio, pursuers=pursuers, obstacles=obstacles)
     match = find_match(method, versus, out, fields, scene, policy, seed)
     if save is None and headless is None:
         player.check_window()
