@@ -19,7 +19,7 @@ from marl_encircle.cli import main
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import executors
 from marl_encircle.experiments import sweep as sweeps
-from marl_encircle.experiments.build import Engine
+from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.train import train

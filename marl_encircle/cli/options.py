@@ -6,11 +6,12 @@ configuration.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marl_encircle.cli.completion import names_of, scenes
+from marl_encircle.experiments.choices import ExecutorName, Profile
 
 if TYPE_CHECKING:
     from marl_encircle.experiments.config import Config
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
 
 SETTING, OUTPUT, CLUSTER = "Setting", "Output", "Cluster"
 """Panels of the help."""
-
-# The same as those of experiments.config and experiments.build, which take seconds to import.
-Profile = Literal["full", "smoke"]
-Engine = Literal["native", "supersuit"]
-ExecutorName = Literal["local", "ray"]
 
 
 def setting_option(metavar: str, text: str, default: str, autocompletion: Callable[[], list[str]] | None = None) -> Any:

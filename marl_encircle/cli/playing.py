@@ -3,11 +3,12 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from marl_encircle.cli.options import OUTPUT, AsJson, Quiet
+from marl_encircle.experiments.choices import AlgorithmName
 
 
 def play_with_command(
@@ -15,7 +16,7 @@ def play_with_command(
         str,
         typer.Argument(help="An id of PettingZoo, such as sisl/multiwalker-v9, or an import path, whose code is run."),
     ],
-    algorithm: Annotated[Literal["maddpg", "matd3"], typer.Option(help="What is trained.")] = "maddpg",
+    algorithm: Annotated[AlgorithmName, typer.Option(help="What is trained.")] = "maddpg",
     world_steps: Annotated[
         int, typer.Option(min=100, metavar="N", help="Steps of all agents of one world to train on.")
     ] = 60_000,

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,7 +11,6 @@ from marl_encircle.cli.options import (
     OUTPUT,
     Algorithm,
     AsJson,
-    Engine,
     Obstacles,
     Out,
     ProfileOption,
@@ -27,6 +26,7 @@ from marl_encircle.cli.options import (
     setting_option,
 )
 from marl_encircle.cli.printing import print_pairs
+from marl_encircle.experiments.choices import Engine, ExportFormat
 from marl_encircle.experiments.yaml_files import ConfigError
 
 if TYPE_CHECKING:
@@ -215,7 +215,7 @@ def evaluate(
 def export(
     run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
     to: Annotated[
-        Literal["onnx", "torchscript", "torch-export"],
+        ExportFormat,
         typer.Option(
             metavar="FORMAT",
             help="onnx; torchscript, which torch has deprecated; or torch-export, which it reads in its place.",

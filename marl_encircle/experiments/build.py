@@ -3,7 +3,7 @@
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import safetensors.torch
@@ -20,7 +20,8 @@ from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
 from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
-from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, Profile, load_config
+from marl_encircle.experiments.choices import Engine, Profile
+from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
 from marl_encircle.experiments.pretrained import find_run, in_words, is_run_path, pretrained_runs, setting_of
 from marl_encircle.experiments.records import POLICY, read_record
@@ -31,8 +32,6 @@ from marl_encircle.maddpg import ALGORITHMS, MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.maddpg.saving import load_actors
 from marl_encircle.spelling import nearest
-
-Engine = Literal["native", "supersuit"]
 
 MAX_HEADER_BYTES = 1 << 16
 """Largest header of one: names and shapes of a few arrays per layer. Each name costs memory, whatever it stands for."""

@@ -8,12 +8,13 @@ import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from pydantic import ConfigDict, ValidationError
 
 from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
+from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.faults import explain, naming_files
 from marl_encircle.experiments.overrides import parse_overrides
 from marl_encircle.experiments.records import Cell, Setting
@@ -28,8 +29,6 @@ from marl_encircle.experiments.sections import (
 from marl_encircle.experiments.sizes import count_weights
 from marl_encircle.experiments.yaml_files import ConfigError, merge
 from marl_encircle.spelling import nearest
-
-Profile = Literal["full", "smoke"]
 
 MAX_POLICY_BYTES = 1 << 26
 """Largest ``policy.safetensors`` that is read back."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -25,17 +25,17 @@ from marl_encircle.core.observations import layout
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.choices import ExportFormat
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
-Format = Literal["onnx", "torchscript", "torch-export"]
 Array = NDArray[np.float32]
 Act = Callable[[Array], Array]
 """From observations (B, N, O) to actions (B, N, U)."""
 
-SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "torchscript": ".pt", "torch-export": ".pt2"}
+SUFFIXES: dict[ExportFormat, str] = {"onnx": ".onnx", "torchscript": ".pt", "torch-export": ".pt2"}
 TOLERANCE = 1e-5
 """Largest difference from ``predict`` in any action."""
 
@@ -85,7 +85,7 @@ class Actors(nn.Module):
         return th.clamp(self.low + 0.5 * (scaled + 1.0) * (self.high - self.low), self.low, self.high)
 
 
-def export_run(run: str | Path, to: Format, out: str | Path | None = None) -> Export:
+def export_run(run: str | Path, to: ExportFormat, out: str | Path | None = None) -> Export:
     """Write the actors of a finished run as one file.
 
     :param run: its folder
@@ -255,12 +255,12 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-_WRITERS: dict[Format, Callable[[Actors, th.Tensor, dict[str, Any]], bytes]] = {
+_WRITERS: dict[ExportFormat, Callable[[Actors, th.Tensor, dict[str, Any]], bytes]] = {
     "onnx": _to_onnx,
     "torchscript": _to_torchscript,
     "torch-export": _to_torch_export,
 }
-_READERS: dict[Format, Callable[[bytes], Act]] = {
+_READERS: dict[ExportFormat, Callable[[bytes], Act]] = {
     "onnx": _from_onnx,
     "torchscript": _from_torchscript,
     "torch-export": _from_torch_export,

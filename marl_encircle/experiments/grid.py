@@ -11,7 +11,8 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, ValidationError
 
 from marl_encircle.core.scenes import SCENES
-from marl_encircle.experiments.config import Config, Profile, difference, load_config
+from marl_encircle.experiments.choices import Profile
+from marl_encircle.experiments.config import Config, difference, load_config
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting

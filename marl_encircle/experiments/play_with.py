@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors
@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from marl_encircle import files
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
 from marl_encircle.experiments.build import load_weights, policy_bytes
+from marl_encircle.experiments.choices import AlgorithmName
 from marl_encircle.experiments.config import MAX_CRITIC_BYTES, MAX_POLICY_BYTES
 from marl_encircle.experiments.divergence import Diverged, fault
 from marl_encircle.experiments.metrics import Interval, student_interval
@@ -34,7 +35,6 @@ from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
-AlgorithmName = Literal["maddpg", "matd3"]
 Returns = NDArray[np.float64]
 """Return of each round, mean over the agents."""
 

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from marl_encircle.experiments.config import Config, Profile
+from marl_encircle.experiments.choices import Profile
+from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file, is_path

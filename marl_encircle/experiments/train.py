@@ -19,7 +19,6 @@ from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint, divergence
 from marl_encircle.experiments.build import (
-    Engine,
     build_model,
     build_vec_env,
     check_engine,
@@ -34,6 +33,7 @@ from marl_encircle.experiments.callbacks import (
     ended_rounds,
     stop_signals,
 )
+from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.evaluate import play_rounds

@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from marl_encircle.experiments.config import Profile
+from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file

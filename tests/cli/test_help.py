@@ -9,15 +9,15 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 from search_files import search_file
 from tiny_runs import TINY, Done, copy_of_finished, tiny, tiny_arguments, train_in_this_process
 
 from marl_encircle import cli
-from marl_encircle.cli import machine, options, tensorboard
-from marl_encircle.experiments import build, config, grid
+from marl_encircle.cli import machine, tensorboard
+from marl_encircle.experiments import config, grid
 from marl_encircle.experiments.train import train
 from marl_encircle.study import calibrate
 from marl_encircle.study.figures import write
@@ -101,11 +101,6 @@ def test_one_thread_is_all_that_torch_gets(tmp_path: Path) -> None:
         cwd=tmp_path, env=environment, capture_output=True, check=True,
     )  # fmt: skip
     assert (tmp_path / "threads").read_text() == "1"
-
-
-def test_options_offer_what_the_library_takes() -> None:
-    assert get_args(options.Profile) == get_args(config.Profile)
-    assert get_args(options.Engine) == get_args(build.Engine)
 
 
 # examples

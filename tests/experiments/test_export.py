@@ -14,21 +14,22 @@ from tiny_runs import copy_of_finished, everything_in, finished
 from marl_encircle.core.observations import bounds
 from marl_encircle.experiments import export
 from marl_encircle.experiments.build import load_run
-from marl_encircle.experiments.export import Array, Format, ParityError, export_run
+from marl_encircle.experiments.choices import ExportFormat
+from marl_encircle.experiments.export import Array, ParityError, export_run
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 
-FORMATS: tuple[Format, ...] = get_args(Format)
+FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[Format, export.Export]:
+def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[ExportFormat, export.Export]:
     pytest.importorskip("onnxruntime")
     folder = tmp_path_factory.mktemp("exported")
     return {to: export_run(finished(), to, folder / f"actors.{to}") for to in FORMATS}
 
 
-def act(to: Format, path: Path, observations: Array) -> Array:
+def act(to: ExportFormat, path: Path, observations: Array) -> Array:
     """Use a file as somebody does who has nothing of this package."""
     if to == "onnx":
         session = importlib.import_module("onnxruntime").InferenceSession(path)
@@ -43,7 +44,9 @@ def act(to: Format, path: Path, observations: Array) -> Array:
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_the_file_acts_as_predict_in_any_number_of_worlds(exported: dict[Format, export.Export], to: Format) -> None:
+def test_the_file_acts_as_predict_in_any_number_of_worlds(
+    exported: dict[ExportFormat, export.Export], to: ExportFormat
+) -> None:
     policy, config, _ = load_run(finished())
     low, high = bounds(config.scenario)
     rng = np.random.default_rng(3)
@@ -58,7 +61,7 @@ def test_the_file_acts_as_predict_in_any_number_of_worlds(exported: dict[Format,
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_the_file_says_whose_the_actors_are(exported: dict[Format, export.Export], to: Format) -> None:
+def test_the_file_says_whose_the_actors_are(exported: dict[ExportFormat, export.Export], to: ExportFormat) -> None:
     path = exported[to].path
     if to == "onnx":
         texts = {entry.key: entry.value for entry in importlib.import_module("onnx").load(path).metadata_props}
@@ -83,20 +86,24 @@ def test_the_file_says_whose_the_actors_are(exported: dict[Format, export.Export
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_the_file_tells_nothing_of_the_machine(exported: dict[Format, export.Export], to: Format) -> None:
+def test_the_file_tells_nothing_of_the_machine(exported: dict[ExportFormat, export.Export], to: ExportFormat) -> None:
     content = exported[to].path.read_bytes()
     assert str(Path(export.__file__).parents[1]).encode() not in content
     assert str(finished()).encode() not in content
 
 
 @pytest.mark.parametrize("to", ["torch-export", "onnx"])
-def test_equal_runs_give_equal_files(exported: dict[Format, export.Export], tmp_path: Path, to: Format) -> None:
+def test_equal_runs_give_equal_files(
+    exported: dict[ExportFormat, export.Export], tmp_path: Path, to: ExportFormat
+) -> None:
     again = export_run(copy_of_finished(tmp_path), to, tmp_path / "again")
     assert again.path.read_bytes() == exported[to].path.read_bytes()
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_actors_that_act_otherwise_are_not_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, to: Format) -> None:
+def test_actors_that_act_otherwise_are_not_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, to: ExportFormat
+) -> None:
     pytest.importorskip("onnxruntime")
     forward = export.Actors.forward
     monkeypatch.setattr(export.Actors, "forward", lambda self, x: forward(self, x) * 0.9999)

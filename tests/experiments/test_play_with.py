@@ -10,8 +10,9 @@ import pytest
 
 from marl_encircle import files
 from marl_encircle.experiments import play_with as module
+from marl_encircle.experiments.choices import AlgorithmName
 from marl_encircle.experiments.divergence import Diverged
-from marl_encircle.experiments.play_with import FIRST_ROUND, AlgorithmName, Played, load_played, play_with, save_policy
+from marl_encircle.experiments.play_with import FIRST_ROUND, Played, load_played, play_with, save_policy
 from marl_encircle.experiments.worlds import find_world
 from marl_encircle.experiments.yaml_files import ConfigError
 

@@ -35,8 +35,8 @@ from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import callbacks, checkpoint, train
-from marl_encircle.experiments.build import Engine
 from marl_encircle.experiments.callbacks import Stopped
+from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.records import config_hash, episodes_from_csv, read_record, read_runs
 from marl_encircle.experiments.yaml_files import ConfigError

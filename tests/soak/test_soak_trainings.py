@@ -14,7 +14,7 @@ import pytest
 from tiny_runs import contents, everything_in, tiny
 
 from marl_encircle.experiments import checkpoint
-from marl_encircle.experiments.build import Engine
+from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.train import run_folder, train
 
