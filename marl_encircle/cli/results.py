@@ -66,13 +66,13 @@ def reproduce_tables(
     """Train and evaluate what is missing of a grid, and render Tables 1-4 beside the paper's numbers."""
     from marl_encircle.experiments.grid import load_grid
 
-    load_grid(grid)
+    wanted = load_grid(grid)
     from marl_encircle.experiments.live import LiveReport
     from marl_encircle.study.reproduce import reproduce
 
     workers = make_executor(executor, address)
     with LiveReport() as report:
-        done = reproduce(grid, out, jobs, report, workers)
+        done = reproduce(wanted, out, jobs, report, workers)
     counts = {"trained": done.trained, "evaluated": done.evaluated, "reused": done.reused}
     if as_json:
         typer.echo(json.dumps({**counts, "failed": len(done.sweep.failed), "diverged": done.sweep.diverged}))

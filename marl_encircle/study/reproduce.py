@@ -9,7 +9,7 @@ from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
-from marl_encircle.experiments.grid import Grid, load_grid
+from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.records import episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
@@ -36,7 +36,7 @@ class Reproduction(NamedTuple):
 
 
 def reproduce(
-    grid_name: str,
+    grid: Grid,
     results: str | Path,
     n_workers: int,
     report: Callable[[Progress], None] | None = None,
@@ -46,10 +46,8 @@ def reproduce(
 
     A run whose rounds had to be played again counts as evaluated, not as reused. Arguments are those of ``sweep``.
 
-    :raises ConfigError: for a grid that is not allowed
     :raises DamagedFileError: if a run there is not what its record says
     """
-    grid = load_grid(grid_name)
     runs = Path(results) / "runs"
     progress = sweep(grid.jobs, runs, n_workers, report, executor)
     evaluated = 0

@@ -61,10 +61,10 @@ def folders(results: Path) -> list[Path]:
 
 
 def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) -> None:
-    assert counts(reproduce("smoke", tmp_path, 2)) == (2, 0, 0)
+    assert counts(reproduce(load_grid("smoke"), tmp_path, 2)) == (2, 0, 0)
     before = tables(tmp_path)
     assert sorted(before) == TABLES
-    assert counts(reproduce("smoke", tmp_path, 1)) == (0, 0, 2)
+    assert counts(reproduce(load_grid("smoke"), tmp_path, 1)) == (0, 0, 2)
     assert tables(tmp_path) == before
 
     first, second = folders(tmp_path)
@@ -74,14 +74,14 @@ def test_nothing_is_done_twice_and_what_is_lost_is_made_again(tmp_path: Path) ->
     del record["sha256"]["episodes.csv"]
     files.write_json(first / "run.json", record)
     (second / "episodes.csv").unlink()  # its hash stays
-    assert counts(reproduce("smoke", tmp_path, 1)) == (0, 2, 0)
+    assert counts(reproduce(load_grid("smoke"), tmp_path, 1)) == (0, 2, 0)
     assert (first / "episodes.csv").read_bytes() == rounds
     assert tables(tmp_path) == before
 
     (first / "run.json").unlink()  # the run is unfinished, and without a checkpoint starts anew
     for path in (tmp_path / "tables").iterdir():
         path.unlink()
-    assert counts(reproduce("smoke", tmp_path, 1)) == (1, 0, 1)
+    assert counts(reproduce(load_grid("smoke"), tmp_path, 1)) == (1, 0, 1)
     assert (first / "episodes.csv").read_bytes() == rounds
     assert tables(tmp_path) == before
 
@@ -94,18 +94,18 @@ def test_one_policy_fills_the_cells_of_several_settings(tmp_path: Path, monkeypa
     grid = tmp_path / "grid.yaml"
     others = "elsewhere: [{speed_ratio: 1.1, pursuers: 2, obstacles: 1}, {speed_ratio: 1.1, pursuers: 5, obstacles: 1}]"
     grid.write_text(ELSEWHERE.partition("elsewhere")[0].replace("seeds: [0]", f"seeds: [0]\n    {others}"))
-    assert counts(reproduce(str(grid), tmp_path, 1)) == (1, 0, 0)
+    assert counts(reproduce(load_grid(str(grid)), tmp_path, 1)) == (1, 0, 0)
     [run] = read_runs(tmp_path / "runs")
     assert list(run.elsewhere) == [Setting(1.1, 2, 1), Setting(1.1, 5, 1)]
     with (tmp_path / "tables" / "table3.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["method"] == "ours" and row["result"] == "run"]
     assert [row["pursuers"] for row in rows] == ["2", "3", "5"]
-    assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
+    assert counts(reproduce(load_grid(str(grid)), tmp_path, 1)) == (0, 0, 1)
     verified = verify(load_grid(str(grid)), tmp_path)
     assert verified.equal == verified.rounds == 3 * len(run.episodes)
 
     grid.write_text(ELSEWHERE.partition("elsewhere")[0])  # what has been played elsewhere is not asked for any more
-    reproduce(str(grid), tmp_path, 1)
+    reproduce(load_grid(str(grid)), tmp_path, 1)
     with (tmp_path / "tables" / "table3.csv").open() as file:
         assert [row["pursuers"] for row in csv.DictReader(file) if row["result"] == "run"] == ["3"]
 
@@ -113,7 +113,7 @@ def test_one_policy_fills_the_cells_of_several_settings(tmp_path: Path, monkeypa
 def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
     grid = tmp_path / "grid.yaml"
     grid.write_text(ELSEWHERE)
-    assert counts(reproduce(str(grid), tmp_path, 1)) == (1, 0, 0)
+    assert counts(reproduce(load_grid(str(grid)), tmp_path, 1)) == (1, 0, 0)
     [run] = read_runs(tmp_path / "runs")
     [(setting, rounds)] = run.elsewhere.items()
     assert setting == Setting(1.1, 3, 1, "tunnel")
@@ -121,13 +121,13 @@ def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
     assert rounds != run.episodes
     before = everything_in(tmp_path)
     assert "tables/table_scenes.md" in before
-    assert counts(reproduce(str(grid), tmp_path, 1)) == (0, 0, 1)
+    assert counts(reproduce(load_grid(str(grid)), tmp_path, 1)) == (0, 0, 1)
     assert verify(load_grid(str(grid)), tmp_path).rounds == 2 * len(run.episodes)
 
     [path] = tmp_path.rglob("episodes_*.csv")
     rows = path.read_bytes()
     path.unlink()
-    reproduce(str(grid), tmp_path, 1)
+    reproduce(load_grid(str(grid)), tmp_path, 1)
     assert path.read_bytes() == rows
     assert everything_in(tmp_path) == before
 
@@ -140,7 +140,7 @@ def test_policies_are_played_elsewhere_once(tmp_path: Path) -> None:
 def test_rounds_whose_record_was_not_written_any_more_are_played_again(tmp_path: Path, left: str) -> None:
     (tmp_path / "grid.yaml").write_text(ELSEWHERE)
     grid = load_grid(str(tmp_path / "grid.yaml"))
-    reproduce(str(tmp_path / "grid.yaml"), tmp_path, 1)
+    reproduce(load_grid(str(tmp_path / "grid.yaml")), tmp_path, 1)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     [rounds] = tmp_path.rglob("episodes_*.csv")
     record = json.loads((rounds.parent / "run.json").read_text())
@@ -150,25 +150,25 @@ def test_rounds_whose_record_was_not_written_any_more_are_played_again(tmp_path:
         rounds.write_text("round,se")
     write_tables(grid, tmp_path)
     assert verify(grid, tmp_path).passed
-    reproduce(str(tmp_path / "grid.yaml"), tmp_path, 1)
+    reproduce(load_grid(str(tmp_path / "grid.yaml")), tmp_path, 1)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_an_edited_row_is_found(tmp_path: Path) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     path = folders(tmp_path)[0] / "episodes.csv"
     path.write_text(path.read_text().replace(",20,", ",19,", 1))
     with pytest.raises(files.DamagedFileError, match=r"episodes\.csv: changed since it was written"):
-        reproduce("smoke", tmp_path, 1)
+        reproduce(load_grid("smoke"), tmp_path, 1)
 
 
 def test_an_edited_policy_is_not_evaluated(tmp_path: Path) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     folder = folders(tmp_path)[0]
     (folder / "episodes.csv").unlink()
     (folder / "policy.safetensors").write_bytes(b"other")
     with pytest.raises(files.DamagedFileError, match=r"policy\.safetensors: changed"):
-        reproduce("smoke", tmp_path, 1)
+        reproduce(load_grid("smoke"), tmp_path, 1)
 
 
 def test_a_users_method_by_path_has_its_row(tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_users_method_by_path_has_its_row(tmp_path: Path) -> None:
         "    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]\n    seeds: [1]\nshared: []\n"
     )
     results = tmp_path / "results"
-    assert counts(reproduce(str(tmp_path / "grid.yaml"), results, 1)) == (1, 0, 0)
+    assert counts(reproduce(load_grid(str(tmp_path / "grid.yaml")), results, 1)) == (1, 0, 0)
     assert "\nidea,1.1,3,1,random,all,run," in (results / "tables" / "table4.csv").read_text()
     assert "| idea | not run |" in (results / "tables" / "table4.md").read_text()
 
@@ -197,7 +197,7 @@ def test_a_grid_shows_the_methods_it_asks_for_before_they_are_run_and_the_commit
 
 
 def test_runs_that_the_grid_does_not_ask_for_are_not_in_its_tables(tmp_path: Path) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     before = tables(tmp_path)
     train(load_grid("smoke").jobs[0].config, 5, "native", tmp_path / "runs")
     write_tables(load_grid("smoke"), tmp_path)
@@ -210,7 +210,7 @@ def test_a_setting_that_the_paper_lacks_has_its_table_as_long_as_the_grid_asks_f
         "    settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1, scene: tunnel}]\n    seeds: [1]\nshared: []\n"
     )
     results = tmp_path / "results"
-    reproduce(str(tmp_path / "grid.yaml"), results, 1)
+    reproduce(load_grid(str(tmp_path / "grid.yaml")), results, 1)
     assert "tunnel" in (results / "tables" / "table_other.md").read_text()
     assert "tunnel" in (results / "tables" / "table_other.csv").read_text()
     write_tables(load_grid("smoke"), results)
@@ -219,7 +219,7 @@ def test_a_setting_that_the_paper_lacks_has_its_table_as_long_as_the_grid_asks_f
 
 @pytest.mark.parametrize("status", ["finished", "diverged"])
 def test_a_run_of_another_configuration_is_not_shown(tmp_path: Path, status: str) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     before = tables(tmp_path)
     path = folders(tmp_path)[1] / "run.json"
     record = json.loads(path.read_text())
@@ -232,7 +232,7 @@ def test_a_run_of_another_configuration_is_not_shown(tmp_path: Path, status: str
 
 
 def test_a_run_of_either_engine_is_shown(tmp_path: Path) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     before = tables(tmp_path)
     path = folders(tmp_path)[0] / "run.json"
     files.write_json(path, {**json.loads(path.read_text()), "engine": "supersuit"})
@@ -241,14 +241,14 @@ def test_a_run_of_either_engine_is_shown(tmp_path: Path) -> None:
 
 
 def test_a_diverged_run_is_shown_and_not_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reproduce("smoke", tmp_path, 1)
+    reproduce(load_grid("smoke"), tmp_path, 1)
     path = folders(tmp_path)[0] / "run.json"
     record = json.loads(path.read_text())
     del record["sha256"]["episodes.csv"]
     files.write_json(path, {**record, "status": "diverged"})
     (path.parent / "episodes.csv").unlink()
     monkeypatch.setattr(reproduction, "play_rounds", lambda *_: pytest.fail("it was evaluated"))
-    result = reproduce("smoke", tmp_path, 1)
+    result = reproduce(load_grid("smoke"), tmp_path, 1)
     assert counts(result) == (0, 0, 2)
     assert result.sweep.diverged == 1
     assert "diverged" in (tmp_path / "tables" / "table4.md").read_text()
@@ -270,5 +270,5 @@ def test_table_1_is_the_papers() -> None:
 
 def test_an_unknown_grid_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="did you mean smoke"):
-        reproduce("smok", tmp_path / "results", 1)
+        reproduce(load_grid("smok"), tmp_path / "results", 1)
     assert not (tmp_path / "results").exists()
