@@ -82,8 +82,8 @@ def _grid(name: str) -> dict[str, Any]:
     seeds: dict[str, list[int]] = {}
     for job in grid.jobs:
         seeds.setdefault(str(run_path(job.config.cell, job.seed).parent), []).append(job.seed)
-    jobs = grid.jobs[0]
-    return {"scenario": jobs.scenario, "profile": jobs.profile, "frozen": grid.frozen, "seeds": seeds}
+    first = grid.jobs[0]
+    return {"scenario": first.scenario, "profile": first.profile, "frozen": grid.frozen, "seeds": seeds}
 
 
 def _section(kind: Kind, model: type[BaseModel]) -> Callable[[str], dict[str, Any]]:

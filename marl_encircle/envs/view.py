@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -27,16 +26,6 @@ class Layers(NamedTuple):
     trails: bool = True
     lens: bool = True
     """The target's surroundings at large, once it can reach little."""
-
-
-class Layer(StrEnum):
-    """Their names."""
-
-    CIRCLES = "circles"
-    ANGLES = "angles"
-    AREA = "area"
-    TRAILS = "trails"
-    LENS = "lens"
 
 
 class View(NamedTuple):
@@ -93,18 +82,18 @@ def view(
     """
     s, enclosure = simulator.state, simulator.measure.enclosure[closure]
     return View(
-        simulator.scenario,
-        s.pursuers[world],
-        s.velocities[world],
-        s.target[world],
-        s.discs[world],
-        float(s.speed_ratio[world]),
-        enclosure.owner[world],
-        enclosure.distance[world],
-        float(enclosure.movement_range[world]),
-        bool(enclosure.complete[world]),
-        int(simulator.steps[world]),
-        trail,
-        closure,
-        success,
+        scenario=simulator.scenario,
+        pursuers=s.pursuers[world],
+        velocities=s.velocities[world],
+        target=s.target[world],
+        discs=s.discs[world],
+        speed_ratio=float(s.speed_ratio[world]),
+        owner=enclosure.owner[world],
+        distance=enclosure.distance[world],
+        movement_range=float(enclosure.movement_range[world]),
+        complete=bool(enclosure.complete[world]),
+        step=int(simulator.steps[world]),
+        trail=trail,
+        closure=closure,
+        success=success,
     )

@@ -3,7 +3,7 @@
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import safetensors.torch
@@ -241,11 +241,23 @@ def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MA
             return load_actors(path)
         except Exception as error:  # unpickling raises whatever it likes
             raise files.DamagedFileError(path, f"holds no actors: {_one_line(error)}") from error
-    policy, _, _ = load_run(path, wanted)
-    return policy
+    return load_run(path, wanted).policy
 
 
-def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> tuple[MADDPGPolicy, Config, dict[str, Any]]:
+class LoadedRun(NamedTuple):
+    """A run read back.
+
+    :param policy: to act with
+    :param config: of the run, in the setting that was asked for
+    :param record: content of its ``run.json``
+    """
+
+    policy: MADDPGPolicy
+    config: Config
+    record: dict[str, Any]
+
+
+def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> LoadedRun:
     """Return a run's policy, configuration and record; see :func:`load_policy`.
 
     :param run: its folder, or the ``policy.safetensors`` in it
@@ -275,7 +287,7 @@ def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> tuple[
             raise ConfigError(f"{folder} was trained {in_words(trained)}; asked for {in_words(setting)}")
         config = config.in_setting(setting)
         policy = fit_policy(policy, config)
-    return policy, config, record
+    return LoadedRun(policy, config, record)
 
 
 def load_weights(policy: MADDPGPolicy, data: bytes) -> None:

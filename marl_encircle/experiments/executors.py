@@ -23,16 +23,6 @@ class Worker(Protocol):
         """Return None while it works, then a number, negative if it was killed: what it did is in the run folder."""
 
 
-class Process(Worker, Protocol):
-    """A worker of this machine, which can be ended at once."""
-
-    def kill(self) -> None:
-        """End it, whatever it does."""
-
-    def wait(self) -> int:
-        """Wait for its end."""
-
-
 class Executor(Protocol):
     """Starts workers inside its ``with`` block; at its end those still at work write their checkpoints and end."""
 
@@ -58,7 +48,7 @@ class LocalExecutor:
     def __enter__(self) -> Self:
         return self
 
-    def start(self, job: Job, out: str | Path) -> Process:
+    def start(self, job: Job, out: str | Path) -> subprocess.Popen[bytes]:
         """Train a job by the ``train`` command."""
         worker = _start(job, out)
         self._workers.append(worker)

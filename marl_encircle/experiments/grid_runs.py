@@ -1,11 +1,10 @@
 """The runs of a grid that there are, each one what the grid asks for."""
 
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.records import Episode, Run, Setting, read_record, read_runs
+from marl_encircle.experiments.records import Run, read_record, read_runs
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 
@@ -26,9 +25,7 @@ def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
             path = run_folder(config, run.seed, folder)
             # Both engines train the same policy, so that a run of either will do.
             check_same_run(path, config, run.seed, read_record(path).get("engine", "native"))
-    return [replace(run, elsewhere=_of(run.elsewhere, grid.elsewhere.get(run.cell, ()))) for run in runs]
-
-
-def _of(played: Mapping[Setting, Sequence[Episode]], asked: Iterable[Setting]) -> dict[Setting, Sequence[Episode]]:
-    """Return what was played in settings that are asked for, in their order."""
-    return {setting: played[setting] for setting in asked if setting in played}
+    for i, run in enumerate(runs):
+        elsewhere = grid.elsewhere.get(run.cell, ())
+        runs[i] = replace(run, elsewhere={each: run.elsewhere[each] for each in elsewhere if each in run.elsewhere})
+    return runs

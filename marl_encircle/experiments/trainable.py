@@ -101,14 +101,14 @@ def memory_needed(config: Config) -> dict[str, int]:
         "algorithm.buffer_world_steps": 2 * steps * transition,  # beside that of the checkpoint it resumes from
         "algorithm.batch_size": a.batch_size * (transition + joint + hidden),
         "algorithm.net_arch": 20 * sum(count_weights(scenario, a).values()),  # with targets, gradients, two moments
-        "training.n_worlds": worlds_memory(config, config.training.n_worlds),
+        "training.n_worlds": _worlds_memory(config),
     }
 
 
-def worlds_memory(config: Config, n_worlds: int) -> int:
+def _worlds_memory(config: Config) -> int:
     """Return the least memory [bytes] that worlds take: what each direction meets, twice, under both closure rules."""
     scenario = config.scenario
-    return n_worlds * (36 * scenario.n_directions + 8 * scenario.pursuers * observation_size(scenario))
+    return config.training.n_worlds * (36 * scenario.n_directions + 8 * scenario.pursuers * observation_size(scenario))
 
 
 def available_memory() -> int:

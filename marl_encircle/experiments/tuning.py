@@ -14,13 +14,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
+from subprocess import Popen
 from typing import TYPE_CHECKING, Any
 
 from marl_encircle import files, locks
 from marl_encircle.experiments import checkpoint, sweep
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
-from marl_encircle.experiments.executors import LocalExecutor, Process
+from marl_encircle.experiments.executors import LocalExecutor
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.records import MAX_FILE, csv_lines
 from marl_encircle.experiments.search_space import Choices, Space
@@ -146,7 +147,7 @@ class _Attempt:
     folder: Path
     waiting: list[Job]
     started: list[Job] = field(default_factory=list)
-    workers: dict[Job, Process] = field(default_factory=dict)
+    workers: dict[Job, Popen[bytes]] = field(default_factory=dict)
     reported: int = 0
 
     def run(self, job: Job) -> Path:

@@ -6,7 +6,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_encircle.envs.palette import SERIES, Series
+from marl_encircle.envs.palette import SERIES
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.figures.curves import Band, series_of
 from marl_encircle.study.paper import label, rank
@@ -114,17 +114,13 @@ def _band(band: Band, method: str, methods: Sequence[str], last: float) -> str:
 
 
 def _line(points: Sequence[tuple[float, float]], method: str, methods: Sequence[str]) -> str:
-    series = _series(method, methods)
+    series = series_of(method, methods)
     dashes = f' stroke-dasharray="{" ".join(f"{2 * dash:g}" for dash in series.dashes)}"' if series.dashes else ""
     return f'<path class="mean series-{_number(method, methods)}"{dashes} d="{_path(points)}"/>'
 
 
-def _series(method: str, methods: Sequence[str]) -> Series:
-    return series_of(method, methods)
-
-
 def _number(method: str, methods: Sequence[str]) -> int:
-    return SERIES.index(_series(method, methods))
+    return SERIES.index(series_of(method, methods))
 
 
 def _points(places: Sequence[float], success: NDArray[np.float64]) -> list[tuple[float, float]]:
