@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from marl_encircle import files
 from marl_encircle.core.dynamics import move_target, physics_of, repulsion
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.envs.outlines import facing_arc, far_arc, polar
-from marl_encircle.envs.palette import FAINT, GAP, INK, LINE, PURSUERS, SERIES
+from marl_encircle.drawing.outlines import facing_arc, far_arc, polar
+from marl_encircle.drawing.palette import FAINT, GAP, INK, LINE, PURSUERS, SERIES
 from marl_encircle.study.figures.canvas import COLUMN, WIDTH, encode, put_below, rgb, style
 from marl_encircle.study.figures.enclosures import draw_bodies, draw_obstacles, draw_target, show_square
 from marl_encircle.study.figures.situations import draw_figure1, draw_figure3, measure

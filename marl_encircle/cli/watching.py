@@ -77,7 +77,7 @@ def watch(
     ] = None,
 ) -> None:
     """Play rounds of a trained policy in a window (h: its keys), or write one as a film or as pictures."""
-    from marl_encircle.envs.view import Layers
+    from marl_encircle.drawing.view import Layers
     from marl_encircle.replays.watch import find_match
 
     for layer in hide or ():

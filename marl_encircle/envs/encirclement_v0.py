@@ -273,6 +273,6 @@ def _state_space(scenario: Scenario) -> Box:
 
 def _load_renderer() -> Any:
     """Import the drawing, and with it pygame-ce, only once somebody wants to see something."""
-    from marl_encircle.envs import render
+    from marl_encircle.drawing import render
 
     return render

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from marl_encircle import files
-from marl_encircle.envs.palette import LINE
-from marl_encircle.envs.pen import SUPERSAMPLING, pygame
-from marl_encircle.envs.render import EVERYTHING, array_of, draw_tall, draw_wide, shrunk
-from marl_encircle.envs.view import Layers
+from marl_encircle.drawing.palette import LINE
+from marl_encircle.drawing.pen import SUPERSAMPLING, pygame
+from marl_encircle.drawing.render import EVERYTHING, array_of, draw_tall, draw_wide, shrunk
+from marl_encircle.drawing.view import Layers
 from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match

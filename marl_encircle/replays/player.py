@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from marl_encircle.envs.palette import BACKGROUND, FAINT, GROOVE, INK, LINE, PAPER
-from marl_encircle.envs.pen import SUPERSAMPLING, draw_bar, pygame, write
-from marl_encircle.envs.render import EVERYTHING, check_display, open_window
-from marl_encircle.envs.view import Layers
+from marl_encircle.drawing.palette import BACKGROUND, FAINT, GROOVE, INK, LINE, PAPER
+from marl_encircle.drawing.pen import SUPERSAMPLING, draw_bar, pygame, write
+from marl_encircle.drawing.render import EVERYTHING, check_display, open_window
+from marl_encircle.drawing.view import Layers
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.film import LAST, large_drawing
 from marl_encircle.replays.watch import Match

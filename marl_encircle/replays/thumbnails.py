@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from marl_encircle.envs.palette import FAINT, GOOD, PAPER
-from marl_encircle.envs.pen import SUPERSAMPLING, pygame, write
-from marl_encircle.envs.render import array_of, draw_scene
+from marl_encircle.drawing.palette import FAINT, GOOD, PAPER
+from marl_encircle.drawing.pen import SUPERSAMPLING, pygame, write
+from marl_encircle.drawing.render import array_of, draw_scene
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.tensorboard import Picture
 from marl_encircle.maddpg.policies import MADDPGPolicy

@@ -10,7 +10,7 @@ import numpy as np
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.observations import bounds
-from marl_encircle.envs.view import View
+from marl_encircle.drawing.view import View
 from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.pretrained import (

@@ -19,9 +19,9 @@ from PIL import Image
 from tiny_runs import command, copy_of_finished, finished, tiny
 
 from marl_encircle.core.simulator import world_seeds
-from marl_encircle.envs.pen import SUPERSAMPLING
-from marl_encircle.envs.render import PANEL, SCENE, TALL_PANEL, TALL_SCENE, TALL_TITLE, array_of, draw_tall, shrunk
-from marl_encircle.envs.view import Layers
+from marl_encircle.drawing.pen import SUPERSAMPLING
+from marl_encircle.drawing.render import PANEL, SCENE, TALL_PANEL, TALL_SCENE, TALL_TITLE, array_of, draw_tall, shrunk
+from marl_encircle.drawing.view import Layers
 from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.pretrained import find_run
@@ -360,7 +360,8 @@ def test_keys_pause_step_change_speed_and_round(unseen: None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "layer"), list(zip((pygame.K_a, pygame.K_c, pygame.K_r, pygame.K_t, pygame.K_z), Layers._fields, strict=True))
+    ("key", "layer"),
+    list(zip((pygame.K_a, pygame.K_c, pygame.K_r, pygame.K_t, pygame.K_z), Layers._fields, strict=True)),
 )
 def test_a_layers_key_changes_the_scene_alone_and_back(unseen: None, key: int, layer: str) -> None:
     number, step = lens_moment()

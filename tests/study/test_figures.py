@@ -23,7 +23,7 @@ from PIL import Image
 from tiny_runs import TINY, finished
 
 from marl_encircle import files
-from marl_encircle.envs.palette import PURSUERS, SERIES
+from marl_encircle.drawing.palette import PURSUERS, SERIES
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import Config, load_config
@@ -354,7 +354,7 @@ def test_matplotlib_is_needed_for_figures_alone() -> None:
     program = """
 import sys
 sys.modules["matplotlib"] = None
-import marl_encircle.cli, marl_encircle.replays.replay, marl_encircle.envs.palette
+import marl_encircle.cli, marl_encircle.replays.replay, marl_encircle.drawing.palette
 try:
     import marl_encircle.study.figures.write
 except ImportError as error:
@@ -366,7 +366,7 @@ except ImportError as error:
 
 def test_the_palette_needs_neither_pygame_nor_matplotlib() -> None:
     program = (
-        "import sys; import marl_encircle.envs.palette, marl_encircle.envs.outlines; "
+        "import sys; import marl_encircle.drawing.palette, marl_encircle.drawing.outlines; "
         "print([name for name in ('pygame', 'matplotlib') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

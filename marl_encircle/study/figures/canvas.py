@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from marl_encircle.envs.palette import FAINT, INK, LINE, Colour
+from marl_encircle.drawing.palette import FAINT, INK, LINE, Colour
 
 WIDTH = 7.16
 """Both columns of a paper's page [inches]."""

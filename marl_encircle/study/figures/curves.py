@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from marl_encircle.envs.palette import SERIES, Series
+from marl_encircle.drawing.palette import SERIES, Series
 from marl_encircle.experiments.metrics import share_interval
 from marl_encircle.experiments.records import Cell, Setting, csv_lines
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter

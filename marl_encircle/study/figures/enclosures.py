@@ -10,8 +10,8 @@ from matplotlib.patches import Wedge as Sector
 from numpy.typing import NDArray
 
 from marl_encircle.core.geometry import NOBODY
-from marl_encircle.envs.outlines import borders, facing_arc, polar, stretches, wedges
-from marl_encircle.envs.palette import (
+from marl_encircle.drawing.outlines import borders, facing_arc, polar, stretches, wedges
+from marl_encircle.drawing.palette import (
     GAP,
     INK,
     OBSTACLE,

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator
-from marl_encircle.envs.outlines import borders, polar, stretches
-from marl_encircle.envs.palette import FAINT, GAP, INK, OBSTACLE, PURSUERS, pursuer_colour
+from marl_encircle.drawing.outlines import borders, polar, stretches
+from marl_encircle.drawing.palette import FAINT, GAP, INK, OBSTACLE, PURSUERS, pursuer_colour
 from marl_encircle.replays.replay import Snapshot
 from marl_encircle.study.figures.canvas import COLUMN, NORMAL, WIDTH, put_below, rgb, style, write_letter
 from marl_encircle.study.figures.enclosures import (

@@ -6,7 +6,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_encircle.envs.palette import SERIES
+from marl_encircle.drawing.palette import SERIES
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.figures.curves import Band, series_of
 from marl_encircle.study.paper import label, rank

@@ -9,8 +9,8 @@ from html import escape
 from importlib import resources
 from typing import Any, NamedTuple
 
-from marl_encircle.envs import palette
-from marl_encircle.envs.palette import Colour
+from marl_encircle.drawing import palette
+from marl_encircle.drawing.palette import Colour
 from marl_encircle.study.typeset import Styled, Table, Text
 
 PAIRED = ("table2", "table3", "table4")

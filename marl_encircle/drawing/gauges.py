@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marl_encircle.core.geometry import NOBODY, Closure
-from marl_encircle.envs.palette import FAINT, GOOD, INK, LINE, OBSTACLE, PAPER, Colour, pursuer_colour, readable_on
-from marl_encircle.envs.pen import SUPERSAMPLING, cut, draw_bar, draw_owners, pygame, write
-from marl_encircle.envs.view import View
+from marl_encircle.drawing.palette import FAINT, GOOD, INK, LINE, OBSTACLE, PAPER, Colour, pursuer_colour, readable_on
+from marl_encircle.drawing.pen import SUPERSAMPLING, cut, draw_bar, draw_owners, pygame, write
+from marl_encircle.drawing.view import View
 
 MARGIN = 22
 """Between the panel's edge and what is in it [pixels]."""

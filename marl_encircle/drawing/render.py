@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_encircle.envs.gauges import Panel
-from marl_encircle.envs.outlines import facing_arc, far_arc, polar, wedges
-from marl_encircle.envs.palette import (
+from marl_encircle.drawing.gauges import Panel
+from marl_encircle.drawing.outlines import facing_arc, far_arc, polar, wedges
+from marl_encircle.drawing.palette import (
     BACKGROUND,
     GOOD,
     INK,
@@ -28,8 +28,8 @@ from marl_encircle.envs.palette import (
     pursuer_colour,
     readable_on,
 )
-from marl_encircle.envs.pen import SUPERSAMPLING, draw_owners, pygame, write
-from marl_encircle.envs.view import Layers, View, view
+from marl_encircle.drawing.pen import SUPERSAMPLING, draw_owners, pygame, write
+from marl_encircle.drawing.view import Layers, View, view
 
 __all__ = [
     "PANEL",

@@ -11,11 +11,12 @@ import pygame
 import pytest
 from pettingzoo_tests import render_test
 
-from marl_encircle.envs import encirclement_v0, palette, pen, render
+from marl_encircle.drawing import palette, pen, render
+from marl_encircle.drawing.outlines import facing_arc, far_arc, polar
+from marl_encircle.drawing.view import Layers
+from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.encirclement_v0 import parallel_env
-from marl_encircle.envs.outlines import facing_arc, far_arc, polar
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
-from marl_encircle.envs.view import Layers
 
 SHAPE = (render.SCENE, render.SCENE + render.PANEL, 3)
 
@@ -309,7 +310,7 @@ except ImportError as error:
 
 def test_pygame_does_not_advertise() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "import marl_encircle.envs.render"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", "import marl_encircle.drawing.render"], capture_output=True, text=True, check=True
     )
     assert (done.stdout, done.stderr) == ("", "")
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle.core.geometry import NOBODY
-from marl_encircle.envs.outlines import borders, stretches
-from marl_encircle.envs.palette import GROOVE, LINE, Colour, entity_colour
+from marl_encircle.drawing.outlines import borders, stretches
+from marl_encircle.drawing.palette import GROOVE, LINE, Colour, entity_colour
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 try:
