@@ -74,7 +74,10 @@ GridOption = Annotated[
     ),
 ]
 Out = Annotated[Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs.")]
-Results = Annotated[Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs/ and tables/.")]
+Results = Annotated[
+    Path,
+    typer.Option("--results", "--out", metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs/ and tables/."),
+]
 AsJson = Annotated[bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print one JSON object.")]
 Quiet = Annotated[bool, typer.Option("--quiet", rich_help_panel=OUTPUT, help="No progress bar.")]
 Jobs = Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time, one processor core each.")]
