@@ -89,7 +89,7 @@ def draw(view: View, layers: Layers = EVERYTHING) -> Any:
 
 
 def draw_wide(view: View, layers: Layers = EVERYTHING) -> Any:
-    """Return the same, ``SUPERSAMPLING`` times as large."""
+    """Return a drawing with the panel at its right, ``SUPERSAMPLING`` times its finished size; see :func:`shrunk`."""
     large = _sheet(SCENE + PANEL, SCENE)
     draw_scene(_part(large, 0, 0, SCENE, SCENE), view, layers)
     Panel(_part(large, SCENE, 0, PANEL, SCENE), view).draw_column()
@@ -97,7 +97,7 @@ def draw_wide(view: View, layers: Layers = EVERYTHING) -> Any:
 
 
 def draw_tall(view: View, layers: Layers = EVERYTHING) -> Any:
-    """Return a narrower drawing, the panel below, of which two fit side by side; as large as that."""
+    """Return a narrower drawing, the panel below, of which two fit side by side, ``SUPERSAMPLING`` times its finished size."""
     large = _sheet(TALL_SCENE, TALL_TITLE + TALL_SCENE + TALL_PANEL)
     Panel(_part(large, 0, 0, TALL_SCENE, TALL_TITLE), view).draw_head()
     draw_scene(_part(large, 0, TALL_TITLE, TALL_SCENE, TALL_SCENE), view, layers)
@@ -288,7 +288,7 @@ class _Scene:
         return self.side / 2 + float(x) * self.scale, self.side / 2 - float(y) * self.scale
 
     def _pixels(self, places: Array) -> list[tuple[float, float]]:
-        """Return the same of many places, (K, 2)."""
+        """Return where places in the scene, (K, 2), lie on the surface; see :meth:`_pixel`."""
         away = (places - self.centre) * self.scale
         return list(zip((self.side / 2 + away[:, 0]).tolist(), (self.side / 2 - away[:, 1]).tolist(), strict=True))
 

@@ -20,7 +20,7 @@ from marl_encircle.envs.vec_env import EncirclementVecEnv
 class _Part(NamedTuple):
     """The worlds of one setting.
 
-    :param env: they
+    :param env: the worlds, all of one scenario
     :param worlds: which of all worlds they are
     :param columns: where their observations stand in those of the largest scenario
     """

@@ -34,7 +34,7 @@ def drawing(match: Match, number: int, step: int, layers: Layers = EVERYTHING) -
 
 
 def large_drawing(match: Match, number: int, step: int, layers: Layers = EVERYTHING, tall: bool = False) -> Any:
-    """Return the same, ``SUPERSAMPLING`` times as large.
+    """Return a drawing of one moment of a round, ``SUPERSAMPLING`` times its finished size.
 
     :param tall: with the panel below the scene, as it always is of two policies
     """

@@ -46,7 +46,7 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
 
 
 def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
-    """Return the same as a table."""
+    """Return the paired differences of Ours to every other method as a table; see :func:`render_differences`."""
     shown = [_shown(row) for row in _all_rows(cells, runs)]
     return Table("table_differences", "Ours minus the others", _HEADER, shown, [*_NOTES, *notes])
 
