@@ -97,7 +97,7 @@ def draw_wide(view: View, layers: Layers = EVERYTHING) -> Any:
 
 
 def draw_tall(view: View, layers: Layers = EVERYTHING) -> Any:
-    """Return a narrower drawing, the panel below, of which two fit side by side, ``SUPERSAMPLING`` times its finished size."""
+    """Return a narrower drawing, the panel below, two of which fit side by side; ``SUPERSAMPLING`` times its size."""
     large = _sheet(TALL_SCENE, TALL_TITLE + TALL_SCENE + TALL_PANEL)
     Panel(_part(large, 0, 0, TALL_SCENE, TALL_TITLE), view).draw_head()
     draw_scene(_part(large, 0, TALL_TITLE, TALL_SCENE, TALL_SCENE), view, layers)

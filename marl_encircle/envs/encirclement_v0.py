@@ -26,7 +26,7 @@ Weights = Mapping[str, float | Mapping[str, float] | None]
 
 def parallel_env(
     scenario: Scenario | None = None,
-    terms: Weights | Reward | None = None,
+    reward: Reward | Weights | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
     **scenario_fields: Any,
@@ -34,7 +34,7 @@ def parallel_env(
     """Return one world in which all pursuers act at once.
 
     :param scenario: the rules; the paper's by default
-    :param terms: weight of each reward term, or a whole :class:`Reward`; the paper's by default
+    :param reward: the reward, or only the weights of its terms; the paper's by default
     :param max_cycles: steps after which a round is truncated; the scenario's by default
     :param render_mode: None, ``human`` or ``rgb_array``
     :param scenario_fields: fields of the scenario to change, such as ``speed_ratio=1.3``
@@ -49,7 +49,8 @@ def parallel_env(
             raise TypeError(f"{name:.80}: unknown scenario field{nearest(name, known)}")
     if max_cycles is not None:
         scenario_fields["max_cycles"] = max_cycles
-    reward = terms if isinstance(terms, Reward) else Reward() if terms is None else Reward(terms)
+    if not isinstance(reward, Reward):
+        reward = Reward() if reward is None else Reward(reward)
     return EncirclementEnv(replace(scenario or Scenario(), **scenario_fields), reward, render_mode)
 
 

@@ -132,7 +132,7 @@ def test_without_a_seed_every_environment_plays_other_rounds() -> None:
 
 
 def test_rewards_and_ends_are_those_of_the_simulator() -> None:
-    env = parallel_env(terms={"time": 3.0}, max_cycles=2)
+    env = parallel_env(reward={"time": 3.0}, max_cycles=2)
     env.reset(seed=0)
     for last in (False, True):
         _, rewards, terminations, truncations, infos = env.step(still(env))
@@ -150,7 +150,7 @@ def test_rewards_and_ends_are_those_of_the_simulator() -> None:
 def test_success_terminates_also_at_the_time_limit() -> None:
     # Any area is small enough, and with twenty pursuers some round begins with the target in their midst.
     env = parallel_env(
-        pursuers=20, obstacles=0, speed_ratio=1.0, movement_range_limit=100.0, max_cycles=1, terms={"completion": 1.0}
+        pursuers=20, obstacles=0, speed_ratio=1.0, movement_range_limit=100.0, max_cycles=1, reward={"completion": 1.0}
     )
     for seed in range(20):
         env.reset(seed=seed)
@@ -168,7 +168,7 @@ def test_the_closure_rule_decides_what_counts_as_success() -> None:
     ends = {}
     for closure in ("all", "pursuers"):
         reward = Reward({"time": 1.0}, closure=closure)  # type: ignore[arg-type]
-        env = parallel_env(terms=reward, obstacles=8, obstacle_radius=0.15, movement_range_limit=100.0, max_cycles=1)
+        env = parallel_env(reward=reward, obstacles=8, obstacle_radius=0.15, movement_range_limit=100.0, max_cycles=1)
         ends[closure] = 0
         for seed in range(40):
             env.reset(seed=seed)
@@ -290,9 +290,9 @@ def test_fields_change_the_scenario_given() -> None:
 
 
 def test_terms_are_weights_or_a_reward() -> None:
-    assert parallel_env(terms={"time": 2.0}).reward == Reward({"time": 2.0})
+    assert parallel_env(reward={"time": 2.0}).reward == Reward({"time": 2.0})
     reward = Reward({"time": 2.0}, closure="pursuers", scale=1.0)
-    assert parallel_env(terms=reward).reward is reward
+    assert parallel_env(reward=reward).reward is reward
     assert parallel_env().reward == Reward()
 
 
@@ -322,9 +322,9 @@ def test_an_unknown_field_is_an_error_that_names_the_nearest() -> None:
 
 def test_an_unknown_term_is_an_error_that_names_the_nearest() -> None:
     with pytest.raises(ValueError, match=r"terms\.overal_angle: unknown reward term; did you mean overall_angle\?"):
-        parallel_env(terms={"overal_angle": 1.0})
+        parallel_env(reward={"overal_angle": 1.0})
     with pytest.raises(ValueError, match="terms must be a mapping of terms to their weights; got 'ours'"):
-        parallel_env(terms="ours")  # type: ignore[arg-type]
+        parallel_env(reward="ours")  # type: ignore[arg-type]
 
 
 def test_a_value_out_of_range_is_an_error() -> None:

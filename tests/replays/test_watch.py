@@ -370,7 +370,7 @@ def test_a_layers_key_changes_the_scene_alone_and_back(unseen: None, key: int, l
     shown.step = step
     before = array_of(shrunk(shown.frame()))
     press(shown, key)
-    assert shown.layers == Layers()._replace(**{layer.value: False})
+    assert shown.layers == Layers()._replace(**{layer: False})
     changed = (array_of(shrunk(shown.frame())) != before).any(axis=2)
     assert 50 < changed[:SCENE, :SCENE].sum() < 0.3 * SCENE * SCENE
     assert not changed[:, SCENE:].any()
