@@ -58,7 +58,7 @@ class GridConfig(Section):
 
     :param elsewhere: scenes that no run was trained in
     :param frozen: the commit in which scenario and recipe were frozen, 40 hexadecimal digits; the tables name it
-    :param amended: what has changed in them since, in a sentence
+    :param amended: what has changed in them since, and where both results are
     """
 
     profile: Profile
@@ -110,7 +110,7 @@ class Grid(NamedTuple):
 
     :param aliases: cell -> the cell whose runs it shares
     :param frozen: the commit in which scenario and recipe were frozen
-    :param amended: what has changed in them since, in a sentence
+    :param amended: what has changed in them since, and where both results are
     :param elsewhere: cell of a training -> other settings in which its policies are played too
     """
 

@@ -11,8 +11,8 @@ Three kinds of interval, not to be mixed:
   to agree (in the extreme, all the same: t has no width then) and when all seeds play the same rounds: luck with the
   rounds moves all of them together, so the spread between seeds cannot show it. A share's floor is Wilson's interval
   for the rounds of one seed, another mean's is Student's over the distinct rounds.
-- two methods, ``success_difference`` and ``length_difference``: the same over the paired differences, round by round
-  and seed by seed. "No difference shown" where the interval covers zero.
+- two methods, ``success_difference``, ``length_difference`` and ``sigma_difference``: the same over the paired
+  differences, round by round and seed by seed. "No difference shown" where the interval covers zero.
 
 A percentile bootstrap over three to five seeds is far too narrow and is not used; the tests show both. The limit of the
 cell's interval: where the seeds spread as widely as their distance to 100 % (98 % on average with 2 points of spread),
@@ -125,6 +125,29 @@ class Difference(NamedTuple):
             return "no difference shown"
         return "higher" if self.mean > 0 else "lower"
 
+    @property
+    def p_value(self) -> float | None:
+        """Two-sided p of no difference, by Student's t from the interval, at whose end it is 0.05; None without."""
+        if self.interval is None:
+            return None
+        half = max(self.interval.high - self.mean, self.mean - self.interval.low)
+        if half == 0:
+            return float(self.mean == 0)
+        return float(2 * stats.t.sf(abs(self.mean) / half * _student_quantile(self.seeds - 1), self.seeds - 1))
+
+
+def holm(p_values: Sequence[float], level: float = 1 - CONFIDENCE) -> list[bool]:
+    """Return which hypotheses Holm's step-down procedure rejects: the error over all of them is at most the level.
+
+    :param p_values: of each hypothesis
+    """
+    rejected = [False] * len(p_values)
+    for k, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        if p_values[i] > level / (len(p_values) - k):
+            break
+        rejected[i] = True
+    return rejected
+
 
 def summarise_run(episodes: Sequence[Episode], closure: Closure) -> RunSummary:
     """S, MEL and sigma_c of one run under a closure rule.
@@ -209,6 +232,19 @@ def length_difference(
         lambda episodes: _lengths(episodes, closure_first),
         lambda episodes: _lengths(episodes, closure_second),
     )
+
+
+def sigma_difference(
+    first: Mapping[int, Sequence[Episode]], second: Mapping[int, Sequence[Episode]]
+) -> Difference | None:
+    """Paired difference of sigma_c over all rounds, first minus second [rad].
+
+    :param first: training seed -> rounds of the first method
+    :param second: the same of the second, on the same rounds
+    :return: the difference over the training seeds both have; None without a common seed
+    :raises ValueError: when the rounds of a common seed are not the same
+    """
+    return _difference(first, second, _sigmas, _sigmas)
 
 
 def same_rounds(first: Sequence[Episode], second: Sequence[Episode]) -> bool:

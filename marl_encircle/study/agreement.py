@@ -1,6 +1,7 @@
 """How near the study comes to the paper: its numbers, and the order in which it puts the methods."""
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import combinations
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from scipy import stats
 
 from marl_encircle.experiments.metrics import CONFIDENCE, Difference
 from marl_encircle.experiments.records import Cell
-from marl_encircle.study.cells import CellRuns, result_of
+from marl_encircle.study.cells import CellRuns, pursuers_suffice, result_of
 from marl_encircle.study.differences import paired_success
 from marl_encircle.study.paper import LABELS, TABLE_METHODS, PaperResult, label
 from marl_encircle.study.typeset import DASH, Styled, Table, Text, markdown, setting_columns, to_csv, with_interval
@@ -23,12 +24,12 @@ _NUMBERS_HEADER = ["Cells", "Number", "Mean absolute ΔS", "Mean ΔS", "Mean abs
 _NUMBERS_NOTES: list[Text] = [
     "Δ: this study's number minus the paper's, each method under its own closure rule; S in points, MEL in steps.",
     (
-        "Calibrated on: the cells by which the scenario was chosen, so that their nearness shows nothing. Held out: all"
-        " others for which the paper has a number; the lines by method are of these."
+        "Calibrated on: the cells by which the scenario was chosen, and those that show their runs, so that their"
+        " nearness shows nothing. Held out: all others for which the paper has a number; the lines below are of these."
     ),
     "ΔMEL is over the cells in which this study has a success.",
 ]
-_ORDER_HEADER = ["λ", "n", "m", "Pair", "Paper", "This study", "Verdict"]
+_ORDER_HEADER = ["λ", "n", "m", "Pair", "Paper", "This study", "Order", "Paper's difference"]
 _ORDER_NOTES: list[Text] = [
     (
         "Pairs of methods whose S differs in the paper by more than the noise of its evaluation rounds: 1.96 standard"
@@ -37,8 +38,9 @@ _ORDER_NOTES: list[Text] = [
     ),
     (
         "Difference: S of the first minus S of the second, in points; of this study paired by seed and round, with its"
-        " 95 % interval. Shown: the interval leaves out zero."
+        " 95 % interval. Shown: the interval leaves out zero. Paper's difference: whether it lies within that interval."
     ),
+    "A method that shows another's runs is not compared.",
 ]
 
 
@@ -69,8 +71,16 @@ class Pair(NamedTuple):
     @property
     def verdict(self) -> str:
         """Whether this study puts them in the paper's order."""
-        order = "same" if self.ours.mean * self.paper > 0 else "opposite" if self.ours.mean else "no"
-        return f"{order} order" + ("" if self.ours.shown else ", not shown")
+        order = "same" if self.ours.mean * self.paper > 0 else "opposite" if self.ours.mean else "none"
+        return order + ("" if self.ours.shown else ", not shown")
+
+    @property
+    def place(self) -> str:
+        """Where the paper's difference lies; empty where this study's has no interval."""
+        if self.ours.interval is None:
+            return ""
+        low, high = (100 * bound for bound in self.ours.interval)
+        return "within" if low <= self.paper <= high else "outside"
 
 
 def render_agreement(
@@ -89,6 +99,7 @@ def render_agreement(
     gaps = gaps_of(runs, paper)
     if not gaps:
         return {}
+    calibrated = {gap.cell for gap in gaps if _trained_as(gap.cell, runs) in calibrated}
     numbers = numbers_table(gaps, calibrated)
     order = order_table(pairs_of(runs, paper))
     sections = (
@@ -122,11 +133,16 @@ def gaps_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) ->
 
 
 def pairs_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) -> Iterator[Pair]:
-    """Yield the pairs that differ in the paper by more than its noise and can be compared here, by setting."""
+    """Yield the pairs that differ in the paper by more than its noise and can be compared here, by setting.
+
+    None of them shows another method's runs: that pair is the other method's too.
+    """
     settings = dict.fromkeys(cell.setting for cell in paper)
     for setting in sorted(settings):
         for methods in combinations(reversed(TABLE_METHODS), 2):
             first, second = (Cell(method, setting) for method in methods)
+            if any(_trained_as(cell, runs) != cell for cell in (first, second)):
+                continue
             difference = _papers_difference(paper.get(first), paper.get(second))
             ours = paired_success(*(result_of(cell, runs.get(cell)) for cell in (first, second)))
             if difference is not None and ours is not None:
@@ -134,12 +150,14 @@ def pairs_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) -
 
 
 def numbers_table(gaps: Iterable[Gap], calibrated: Collection[Cell]) -> Table:
-    """Mean differences to the paper's numbers, over the held-out cells and by method."""
+    """Mean differences to the paper's numbers, over the held-out cells, by Eq. 6 and by method."""
     gaps = list(gaps)
     held_out = [gap for gap in gaps if gap.cell not in calibrated]
     groups = {
         "calibrated on": [gap for gap in gaps if gap.cell in calibrated],
         "held out": held_out,
+        "Eq. 6 holds": [gap for gap in held_out if pursuers_suffice(gap.cell.setting)],
+        "Eq. 6 fails": [gap for gap in held_out if not pursuers_suffice(gap.cell.setting)],
         **{LABELS[name]: [gap for gap in held_out if gap.cell.method == name] for name in TABLE_METHODS},
     }
     rows: list[list[Text]] = []
@@ -160,13 +178,23 @@ def order_table(pairs: Iterable[Pair]) -> Table:
             Styled(f"{pair.paper:+.1f}", "italic"),
             "".join(with_interval(pair.ours, 100, "+.1f")),
             pair.verdict,
+            pair.place,
         ]
         for pair in pairs
     ]
-    verdicts = [pair.verdict for pair in pairs]
-    counts = "; ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts), reverse=True))
-    summary: list[Text] = [f"Of {len(pairs)} pairs: {counts}."] if pairs else ["No pair can be compared."]
+    counts = "; ".join(f"{n} {verdict}" for verdict, n in sorted(Counter(pair.verdict for pair in pairs).items()))
+    outside = sum(pair.place == "outside" for pair in pairs)
+    said = (
+        f"Order of {len(pairs)} pairs: {counts}. The paper's difference lies outside this study's interval in {outside}"
+    )
+    summary: list[Text] = [f"{said}." if pairs else "No pair can be compared."]
     return Table("table_order", "Order of the methods", _ORDER_HEADER, rows, [*summary, *_ORDER_NOTES])
+
+
+def _trained_as(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Cell:
+    """Return the cell whose runs a cell shows: its own, or those of a method that it shares them with."""
+    found = runs.get(cell)
+    return cell._replace(method=found.runs_of) if found and found.runs_of else cell
 
 
 def _papers_difference(first: PaperResult | None, second: PaperResult | None) -> float | None:

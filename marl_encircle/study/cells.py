@@ -49,12 +49,11 @@ class Result(NamedTuple):
     @property
     def impossible(self) -> bool:
         """Whether the pursuers cannot close the circle alone (Eq. 6), have to under the rule, and never did."""
-        setting = self.cell.setting
         return (
             self.summary is not None
             and self.summary.success.mean == 0
             and self.closure == "pursuers"
-            and not Scenario(pursuers=setting.pursuers, speed_ratio=setting.speed_ratio).solvable_without_obstacles
+            and not pursuers_suffice(self.cell.setting)
         )
 
 
@@ -102,6 +101,11 @@ def result_of(cell: Cell, runs: CellRuns | None, closure: Closure | None = None)
     closure = closure or (runs.closure if runs else None)
     summary = metrics.summarise_cell(runs.finished, closure) if runs and runs.finished and closure else None
     return Result(cell, runs, closure, summary)
+
+
+def pursuers_suffice(setting: Setting) -> bool:
+    """Whether the pursuers of a setting can close the circle alone (Eq. 6)."""
+    return Scenario(pursuers=setting.pursuers, speed_ratio=setting.speed_ratio).solvable_without_obstacles
 
 
 def _in_words(cell: Cell) -> str:

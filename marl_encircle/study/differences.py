@@ -8,14 +8,17 @@ from marl_encircle.experiments import metrics
 from marl_encircle.experiments.metrics import Difference
 from marl_encircle.experiments.records import Cell
 from marl_encircle.study.cells import CellRuns, Result
-from marl_encircle.study.paper import label
+from marl_encircle.study.paper import PAPER_METHODS, label
 from marl_encircle.study.typeset import Table, estimate_columns, markdown, setting_columns, to_csv, with_interval
 
-_HEADER = ["Other method", "λ", "n", "m", "Closure ours / other", "S, points", "MEL, steps", "Seeds"]
+_HEADER = ["Other method", "λ", "n", "m", "Closure ours / other", "S, points", "MEL, steps", "sigma_c, rad", "Seeds"]
 _NOTES = [
-    "Ours minus the other method, paired by training seed and evaluation round; MEL over the rounds that both solve.",
+    (
+        "Ours minus the other method, paired by training seed and evaluation round; MEL over the rounds that both"
+        " solve, sigma_c over all rounds, each up to the method's own success."
+    ),
     "In brackets: 95 % interval of the mean over the common training seeds; one seed has none.",
-    "No difference shown: the interval covers zero. The intervals are not corrected for the number of comparisons.",
+    "No difference shown: the interval covers zero. The intervals are each for itself.",
 ]
 
 
@@ -27,6 +30,7 @@ class _Row(NamedTuple):
     closure_other: Closure | None
     success: Difference | None
     length: Difference | None
+    sigma: Difference | None
     nothing: str | None
 
 
@@ -47,26 +51,26 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
 
 def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
     """Return the paired differences of Ours to every other method as a table; see :func:`render_differences`."""
-    shown = [_shown(row) for row in _all_rows(cells, runs)]
-    return Table("table_differences", "Ours minus the others", _HEADER, shown, [*_NOTES, *notes])
+    rows = _all_rows(cells, runs)
+    shown = [_shown(row) for row in rows]
+    return Table("table_differences", "Ours minus the others", _HEADER, shown, [*_NOTES, _corrected(rows), *notes])
 
 
-def best(column: Iterable[Result]) -> Result | None:
-    """Return the cell with the highest S if it is shown to be higher than each of the others, else None.
+def outstanding(column: Iterable[Result]) -> set[Cell]:
+    """Return the cells whose S is shown to be higher than that of each of the paper's other methods.
 
-    Cells without a result, and those in which success is impossible, do not compete.
+    Cells without a result, and those in which success is impossible, are passed over.
 
     :param column: cells of one setting
     """
-    rivals = [result for result in column if result.summary and not result.impossible]
-    if len(rivals) < 2:
-        return None
-    first, *others = sorted(rivals, key=_success, reverse=True)
-    return first if all(_is_higher(first, other) for other in others) else None
-
-
-def _success(result: Result) -> float:
-    return result.summary.success.mean if result.summary else 0.0
+    results = [result for result in column if result.summary and not result.impossible]
+    papers = [result for result in results if result.cell.method in PAPER_METHODS]
+    found = set()
+    for result in results:
+        others = [other for other in papers if other.cell != result.cell]
+        if others and all(_is_higher(result, other) for other in others):
+            found.add(result.cell)
+    return found
 
 
 def _is_higher(first: Result, second: Result) -> bool:
@@ -83,15 +87,16 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
     ours, other = runs.get(Cell("ours", cell.setting)), runs.get(cell)
     nothing = nothing_to_compare(ours, other)
     if nothing is not None or ours is None or other is None or ours.closure is None or other.closure is None:
-        yield _Row(cell, None, None, None, None, nothing)
+        yield _Row(cell, None, None, None, None, None, nothing)
         return
+    sigma = metrics.sigma_difference(ours.finished, other.finished)
     rules: list[tuple[Closure, Closure]] = [(ours.closure, other.closure)]
     if rules != [("all", "all")]:
         rules.append(("all", "all"))
     for closures in rules:
         success = metrics.success_difference(ours.finished, other.finished, *closures)
         length = metrics.length_difference(ours.finished, other.finished, *closures)
-        yield _Row(cell, *closures, success, length, None)
+        yield _Row(cell, *closures, success, length, sigma if closures == rules[0] else None, None)
 
 
 def paired_success(first: Result, second: Result) -> Difference | None:
@@ -123,18 +128,34 @@ def _shown(row: _Row) -> list[str]:
     """Write a row in Markdown."""
     cells = [label(row.cell.method), *row.cell.setting.numbers]
     if row.success is None:
-        return [*cells, "", row.nothing or "", "", ""]
+        return [*cells, "", row.nothing or "", "", "", ""]
     return [
         *cells,
         f"{row.closure_ours} / {row.closure_other}",
         _with_verdict(row.success, 100),
         _with_verdict(row.length, 1) if row.length else "no round both solve",
+        _with_verdict(row.sigma, 1, "+.3f") if row.sigma else "",
         str(row.success.seeds),
     ]
 
 
-def _with_verdict(difference: Difference, scale: float) -> str:
-    return f"{''.join(with_interval(difference, scale, '+.2f'))}: {difference.verdict}"
+def _with_verdict(difference: Difference, scale: float, form: str = "+.2f") -> str:
+    return f"{''.join(with_interval(difference, scale, form))}: {difference.verdict}"
+
+
+def _corrected(rows: Iterable[_Row]) -> str:
+    """Name the differences in S that are shown if all comparisons under the methods' own rules are taken together."""
+    compared = [(row, p) for row in rows if row.sigma and row.success and (p := row.success.p_value) is not None]
+    rejected = metrics.holm([p for _, p in compared])
+    shown: dict[str, list[str]] = {}
+    for (row, _), is_shown in zip(compared, rejected, strict=True):
+        if is_shown:
+            shown.setdefault(label(row.cell.method), []).append(row.cell.setting.symbols)
+    names = "; ".join(f"{method} at {' and '.join(settings)}" for method, settings in shown.items())
+    return (
+        f"Corrected for all {len(compared)} comparisons of S with an interval, each under the methods' own rules, by"
+        f" Holm's procedure, a difference stays shown from {names or 'none'}."
+    )
 
 
 def _record(row: _Row) -> dict[str, str]:
@@ -149,5 +170,7 @@ def _record(row: _Row) -> dict[str, str]:
         "success_verdict": row.success.verdict if row.success else "",
         **estimate_columns("length_difference", row.length, 1),
         "length_verdict": row.length.verdict if row.length else "",
+        **estimate_columns("sigma_c_difference", row.sigma, 1),
+        "sigma_c_verdict": row.sigma.verdict if row.sigma else "",
         "seeds": str(row.success.seeds if row.success else 0),
     }

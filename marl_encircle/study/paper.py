@@ -18,6 +18,8 @@ LABELS = {
 }
 TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
 """Methods of Tables 2-4 in the paper's order; others follow by name."""
+PAPER_METHODS = (*TABLE_METHODS, "model_c")
+"""All that the paper compares."""
 
 
 class PaperResult(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.cells import Result
-from marl_encircle.study.differences import best
+from marl_encircle.study.differences import outstanding
 from marl_encircle.study.paper import PaperResult, label
 from marl_encircle.study.typeset import DASH, Styled, Text, with_interval
 
@@ -15,10 +15,10 @@ _INTERVAL_NOTE = (
     "Interval: of the mean over training seeds (Student's t, at least as wide as the noise of the evaluation rounds)."
     " One seed has no interval."
 )
-_BEST_NOTE = (
-    "Bold: the highest S of a column, only where the 95 % interval of its paired difference (same training seeds and"
-    " rounds) to every other method with a result there leaves out zero. These intervals are not corrected for the"
-    " number of comparisons. MEL is never bold; table_differences compares it."
+_BOLD_NOTE = (
+    "Bold: an S whose paired difference (same training seeds and rounds) to each of the paper's other methods with a"
+    " result there has a 95 % interval above zero. These intervals are not corrected for the number of comparisons. MEL"
+    " is never bold; table_differences compares it."
 )
 _IMPOSSIBLE_NOTE = (
     f"{DASH}: the method has to enclose the target with the pursuers alone, who are too few there (Eq. 6). In brackets:"
@@ -30,6 +30,7 @@ _PAPERS_DASH_NOTE: Text = (
     ": the paper says that the method cannot enclose the target there.",
 )
 _NOT_RUN_NOTE = "Not run: there is no such run here."
+_NOT_ASKED_NOTE = "Empty: the grid does not ask for it."
 _OTHERS_NOTE = "Diverged, unfinished and not evaluated runs are counted, and are not in the means."
 
 
@@ -57,8 +58,8 @@ class Wide(NamedTuple):
 
     header: list[str]
     rows: list[list[Text]]
-    seeds: list[str]
-    """Notes on the runs behind the numbers; none without runs."""
+    notes: list[str]
+    """On the runs behind the numbers."""
 
 
 def wide(layout: Layout, results: Sequence[Result], paper: Mapping[Cell, PaperResult]) -> Wide:
@@ -69,17 +70,20 @@ def wide(layout: Layout, results: Sequence[Result], paper: Mapping[Cell, PaperRe
     """
     at = {result.cell: result for result in results}
     settings = sorted({cell.setting for cell in at})
-    winners = [best(result for result in results if result.cell.setting == setting) for setting in settings]
-    bold = {winner.cell for winner in winners if winner}
+    columns = ([result for result in results if result.cell.setting == setting] for setting in settings)
+    bold = set().union(*map(outstanding, columns))
     rows: list[list[Text]] = []
     for method in dict.fromkeys(cell.method for cell in at):
         cells = [Cell(method, setting) for setting in settings]
-        found = [at.get(cell, Result(cell, None, None, None)) for cell in cells]
-        rows.append([label(method), *(success_and_length(result, result.cell in bold) for result in found)])
+        texts = [success_and_length(at[cell], cell in bold) if cell in at else "" for cell in cells]
+        rows.append([label(method), *texts])
         if any(cell in paper for cell in cells):
-            texts = [_papers(paper[cell]) if cell in paper else "" for cell in cells]
-            rows.append([Styled(text, "italic") if text else "" for text in ("paper", *texts)])
-    return Wide(["Method", *map(layout.head, settings)], rows, _seeds_notes(layout, results))
+            papers = [_papers(paper[cell]) if cell in paper else "" for cell in cells]
+            rows.append([Styled(text, "italic") if text else "" for text in ("paper", *papers)])
+    notes = _seeds_notes(layout, results)
+    if len(at) < len(settings) * len({cell.method for cell in at}):
+        notes.append(_NOT_ASKED_NOTE)
+    return Wide(["Method", *map(layout.head, settings)], rows, notes)
 
 
 def success_and_length(result: Result, bold: bool = False) -> Text:
@@ -118,10 +122,10 @@ def notes_on(
     """Return the notes that such a table needs whatever its closure rule: on the numbers, and on the signs it has.
 
     :param paper: what the paper reports, where the table shows it
-    :param columns_compete: whether the best of a column is bold
+    :param columns_compete: whether what stands out in a column is bold
     """
     results, paper = list(results), paper or {}
-    notes: list[Text] = [_LENGTH_NOTE, _INTERVAL_NOTE, *([_BEST_NOTE] if columns_compete else [])]
+    notes: list[Text] = [_LENGTH_NOTE, _INTERVAL_NOTE, *([_BOLD_NOTE] if columns_compete else [])]
     if any(result.impossible for result in results):
         notes.append(_IMPOSSIBLE_NOTE)
     if any(reported.success_percent is None for reported in paper.values()):

@@ -164,10 +164,10 @@ def _texts(table: Table) -> dict[str, str]:
 def freeze_notes(frozen: str | None, amended: str | None = None) -> list[str]:
     """Return the notes on the commit in which scenario and recipe were frozen, and on what has changed since, if any.
 
-    :param amended: what has changed, in a sentence
+    :param amended: what has changed, and where both results are
     """
     notes = [] if frozen is None else [f"Scenario and recipe frozen in commit {frozen[:12]}."]
-    return notes if amended is None else [*notes, f"Amended since: {amended} table_amendment has both results."]
+    return notes if amended is None else [*notes, f"Amended since: {amended}"]
 
 
 def _ordered(paper: Iterable[Cell], others: Iterable[Cell]) -> list[Cell]:
@@ -185,8 +185,8 @@ def _by_method(cells: Iterable[Cell]) -> list[Cell]:
 def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], more: Sequence[str]) -> Table:
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
-    header, rows, seeds = wide(layout, results, paper)
-    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *seeds, *more]
+    header, rows, behind = wide(layout, results, paper)
+    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *behind, *more]
     return Table(name, layout.title, header, rows, notes)
 
 
@@ -203,8 +203,8 @@ def _common_table(
     for name, paper in reported.items():
         settings = {cell.setting for cell in paper}
         layout = LAYOUTS[name]
-        header, rows, seeds = wide(layout, [result for result in results if result.cell.setting in settings], {})
-        sections.append(markdown(layout.title, header, rows, seeds, level=2))
+        header, rows, behind = wide(layout, [result for result in results if result.cell.setting in settings], {})
+        sections.append(markdown(layout.title, header, rows, behind, level=2))
     every = reported_cells()
     return {
         "table_common_rule.md": "\n".join(sections),

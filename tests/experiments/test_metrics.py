@@ -264,3 +264,38 @@ def test_a_percentile_bootstrap_over_seeds_fails(seeds: int) -> None:
     every_resample = np.array(list(itertools.product(range(seeds), repeat=seeds)))
     low, high = np.percentile(shares[:, every_resample].mean(axis=2), [2.5, 97.5], axis=1)
     assert np.mean((low <= 0.9) & (high >= 0.9)) < 0.88
+
+
+def test_p_is_a_twentieth_where_the_interval_ends_at_zero() -> None:
+    def difference(mean: float) -> metrics.Difference:
+        return metrics.Difference(mean, metrics.Interval(mean - 0.5, mean + 0.5), 4)
+
+    assert difference(0.5).p_value == pytest.approx(0.05)
+    assert difference(-0.5).p_value == pytest.approx(0.05)
+    assert difference(0.0).p_value == pytest.approx(1.0)
+    # t = 2 * 3.182446 at three degrees of freedom
+    assert difference(1.0).p_value == pytest.approx(2 * stats.t.sf(2 * 3.182446, 3), abs=1e-6)
+    assert metrics.Difference(0.3, metrics.Interval(0.3, 0.3), 2).p_value == 0.0
+    assert metrics.Difference(0.0, metrics.Interval(0.0, 0.0), 2).p_value == 1.0
+    assert metrics.Difference(0.3, None, 1).p_value is None
+
+
+@pytest.mark.parametrize(
+    ("p_values", "rejected"),
+    [
+        ([0.01, 0.04, 0.03, 0.005], [True, False, False, True]),  # .005 < .05/4, .01 < .05/3, .03 > .05/2
+        ([0.04], [True]),
+        ([0.04, 0.04], [False, False]),
+        ([], []),
+    ],
+)
+def test_holms_procedure_goes_down_from_the_smallest_p(p_values: list[float], rejected: list[bool]) -> None:
+    assert metrics.holm(p_values) == rejected
+
+
+def test_sigma_is_compared_over_all_rounds() -> None:
+    first = {seed: [episode(0, 5, sigma_c=0.4), episode(1, None, sigma_c=0.6)] for seed in (0, 1)}
+    second = {seed: [episode(0, None, sigma_c=0.2), episode(1, 9, sigma_c=0.2)] for seed in (0, 1)}
+    difference = metrics.sigma_difference(first, second)
+    assert difference is not None
+    assert difference.mean == pytest.approx(0.3)

@@ -58,19 +58,42 @@ def test_only_pairs_that_differ_by_more_than_the_papers_noise_have_an_order() ->
 @pytest.mark.parametrize(
     ("ours", "ma", "verdict"),
     [
-        ((95, 95), (80, 80), "same order"),
-        ((80, 80), (95, 95), "opposite order"),
-        ((90, 99), (95, 80), "same order, not shown"),
-        ((90, 80), (89, 95), "opposite order, not shown"),
-        ((90, 90), (90, 90), "no order, not shown"),
+        ((95, 95), (80, 80), "same"),
+        ((80, 80), (95, 95), "opposite"),
+        ((90, 99), (95, 80), "same, not shown"),
+        ((90, 80), (89, 95), "opposite, not shown"),
+        ((90, 90), (90, 90), "none, not shown"),
     ],
 )
 def test_the_order_is_the_papers_or_not(ours: tuple[int, ...], ma: tuple[int, ...], verdict: str) -> None:
     text = rendered(seeds(OURS, *ours) + seeds(MA, *ma))
     row = markdown_row(text, "1.1", "3", "0", "Ours - Ma")
     assert row[0] == "*+12.0*"
-    assert row[-1] == verdict
-    assert f"- Of 1 pairs: 1 {verdict}." in text
+    assert row[2] == verdict
+    assert f"- Order of 1 pairs: 1 {verdict}. " in text
+
+
+def test_it_is_said_whether_the_papers_difference_is_within_the_interval() -> None:
+    for ma, place in (((85, 87), "within"), ((92, 92), "outside")):
+        text = rendered(seeds(OURS, 98, 97) + seeds(MA, *ma))
+        assert markdown_row(text, "1.1", "3", "0", "Ours - Ma")[0] == "*+12.0*"
+        assert markdown_row(text, "1.1", "3", "0", "Ours - Ma")[3] == place
+        assert text.count(f"lies outside this study's interval in {int(place == 'outside')}.") == 1
+    assert markdown_row(rendered(seeds(OURS, 98) + seeds(MA, 92)), "1.1", "3", "0", "Ours - Ma")[3] == ""
+
+
+def test_a_cell_that_shows_anothers_runs_is_what_the_other_is() -> None:
+    paper = {**PAPER, Cell("model_a", OPEN): PaperResult(97.0, 22.0)}
+    runs = gather(seeds(OURS, 99, 99, step=21) + seeds(MA, 90, 90, step=28), {Cell("model_a", OPEN): OURS})
+    text = render_agreement(runs, paper, (OURS,))["table_agreement.md"]
+    assert markdown_row(text, "calibrated on")[0] == "2"
+    assert [pair.first.method for pair in pairs_of(runs, paper)] == ["ours"], "Model A minus Ma is the same pair"
+
+
+def test_settings_are_told_apart_by_equation_6() -> None:
+    text = rendered(seeds(MA, 90, 90) + seeds(Cell("ours", FAST), 60, 60))
+    assert markdown_row(text, "Eq. 6 holds")[:2] == ["1", "5.00"]
+    assert markdown_row(text, "Eq. 6 fails")[:2] == ["1", "30.00"]
 
 
 def test_what_has_no_runs_is_left_out() -> None:

@@ -152,7 +152,7 @@ def test_where_the_pursuers_alone_cannot_close_the_circle_zero_is_a_dash() -> No
     assert csv_row(rendered["table2.csv"], method="ma2019", speed_ratio="1.2")["success_percent"] == "0.0000"
 
 
-def test_only_a_highest_s_that_is_shown_to_be_higher_than_every_other_is_bold() -> None:
+def test_only_an_s_that_is_shown_to_be_higher_than_each_of_the_papers_is_bold() -> None:
     ours = [finished("ours", ONE, seed, 92) for seed in range(3)]
     low = [finished("model_b", ONE, seed, 60) for seed in range(3)]
     near = [
@@ -170,7 +170,9 @@ def test_only_a_highest_s_that_is_shown_to_be_higher_than_every_other_is_bold() 
     assert "**" not in "".join(first_column(ours[:1] + low)), "one common seed has no interval"
     assert "**" not in "".join(first_column([*ours, finished("model_b", ONE, 7, 1)])), "no common seed"
     better = [finished("my_method", ONE, seed, 100) for seed in range(3)]
-    assert [cell for cell in first_column(ours + low + better) if "**" in cell] == ["**100.0** [96.3, 100.0] / 20.0"]
+    assert [cell.split()[0] for cell in first_column(ours + low + better) if "**" in cell] == ["**92.0**", "**100.0**"]
+    worse = [finished("my_method", ONE, seed, 80) for seed in range(3)]
+    assert [cell.split()[0] for cell in first_column(ours + low + worse) if "**" in cell] == ["**92.0**"]
 
 
 def test_bold_follows_the_closure_rule_of_the_table_and_passes_over_dashes() -> None:
@@ -267,10 +269,12 @@ def test_a_method_that_the_paper_lacks_gets_its_row_after_the_papers() -> None:
     rendered = tables.render_tables(runs, asked=[Cell("idea", ONE), Cell("idea", Setting(1.1, 3, 7))])
     rows = markdown_rows(rendered["table4.md"])[8:]
     assert rows == [
-        ["idea", *["not run"] * 4],
-        ["Model C", "70.0 / 20.0", "80.0 / 20.0", "not run", "not run"],
-        ["my_method", "not run", "90.0 / 20.0", "not run", "not run"],
+        ["idea", "", "not run", "", ""],
+        ["Model C", "70.0 / 20.0", "80.0 / 20.0", "", ""],
+        ["my_method", "", "90.0 / 20.0", "", ""],
     ]
+    assert "- Empty: the grid does not ask for it.\n" in rendered["table4.md"]
+    assert "- Not run: there is no such run here.\n" in rendered["table4.md"]
     assert csv_row(rendered["table2.csv"], method="my_method")["paper_success_percent"] == ""
     assert csv_row(rendered["table2.csv"], method="idea")["result"] == "not run"
     assert markdown_row(rendered["table_differences.md"], "idea", "1.1", "3", "1")[1] == "not run"
@@ -283,7 +287,7 @@ def test_a_policy_is_shown_in_every_setting_that_it_has_played() -> None:
     run = finished("one_for_all", home, 0, 90)
     run = Run(run.cell, 0, "finished", run.closure, run.episodes, played)
     rendered = tables.render_tables([run])
-    assert markdown_row(rendered["table4.md"], "one_for_all") == ["70.0 / 20.0", "80.0 / 30.0", "not run", "not run"]
+    assert markdown_row(rendered["table4.md"], "one_for_all") == ["70.0 / 20.0", "80.0 / 30.0", "", ""]
     settings = [row[:5] for row in markdown_rows(rendered["table_other.md"])]
     assert settings == [["one_for_all", "1.1", "7", "1", "random"], ["one_for_all", "1.4", "5", "3", "random"]]
     tunnel = Run(run.cell, 0, "finished", run.closure, run.episodes, {ONE._replace(scene="tunnel"): run.episodes})
@@ -342,7 +346,7 @@ def test_every_table_for_readers_names_the_commit_in_which_the_recipe_was_frozen
     for name, text in rendered(commit).items():
         assert text.count(note) == (0 if name.endswith(".csv") else 1), name
     assert "frozen" not in "".join(rendered(None).values())
-    amended = "Amended since: the budget is twice as long. table_amendment has both results."
+    amended = "Amended since: the budget is twice as long."
     for name, text in rendered(commit, "the budget is twice as long.").items():
         assert text.replace("\\_", "_").count(amended) == text.count(note) == (0 if name.endswith(".csv") else 1), name
 
