@@ -267,6 +267,20 @@ def test_figure_5_draws_the_summaries() -> None:
     assert any("Ours, n = 4: not run" in text for text in written)
 
 
+def test_figure_5_does_not_join_what_is_lost() -> None:
+    """The angles of rounds that are lost are those of another situation."""
+    shares = {2: 20, 3: 9, 4: 20}
+    runs = {n: {seed: rounds(won, 20) for seed in (0, 1)} for n, won in shares.items()}
+    cells = {n: Cell("model_c", Setting(1.1, n, 1)) for n in shares}
+    figure = draw_figure5({cell: summarise_cell(runs[n], "all") for n, cell in cells.items()})
+    for panel in (0, 1):
+        (line,) = lines(figure, panel, label="Model C")
+        assert np.isnan(line.get_ydata()).tolist() == [False, True, False]
+        (hollow,) = lines(figure, panel, markerfacecolor="white")
+        assert round(float(np.squeeze(hollow.get_xdata()))) == 3
+    assert np.squeeze(hollow.get_ydata()) == 45.0
+
+
 def test_figure_6_draws_the_round_until_its_success() -> None:
     replay, figure = solved_round(finished()), figure6(finished())
     paths = [np.array(line.get_xydata()) for line in lines(figure, linestyle="-", linewidth=0.8)]

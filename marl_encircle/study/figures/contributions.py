@@ -1,5 +1,6 @@
 """Figure 5: how evenly the pursuers contribute, with and without the individual contributing angle."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from matplotlib.artist import Artist
@@ -27,12 +28,15 @@ def draw_figure5(summaries: Mapping[Cell, CellSummary]) -> Figure:
     figure.subplots_adjust(left=0.07, right=0.985, top=0.9, bottom=0.295, wspace=0.2)
     handles = _draw_panel(spread, summaries, lambda summary: summary.sigma_c, 1.0)
     _draw_panel(success, summaries, lambda summary: summary.success, 100.0)
-    write_letter(spread, "a", "spread of the contributing angles")
+    write_letter(spread, "a", "spread of the contributing angles, all rounds")
     write_letter(success, "b", "success")
     spread.set_ylabel(r"$\sigma_c$ [rad]")
     spread.set_ylim(bottom=0.0)
     success.set(ylabel="success S [%]", ylim=(-2, 102), yticks=range(0, 101, 20))
-    put_below(figure, handles, "mean over the training seeds and its 95 % interval; one seed has no interval")
+    text = (
+        "mean over the training seeds and its 95 % interval; hollow, not joined: less than half of the rounds are won"
+    )
+    put_below(figure, handles, text)
     return figure
 
 
@@ -45,9 +49,11 @@ def _draw_panel(
     for place, method in enumerate(METHODS):
         settings = [setting for setting in SETTINGS if Cell(method, setting) in summaries]
         if settings:
-            estimates = [value(summaries[Cell(method, setting)]) for setting in settings]
+            found = [summaries[Cell(method, setting)] for setting in settings]
             shift = 0.1 * (place - (len(METHODS) - 1) / 2)
-            handles.append(_draw_method(axes, method, [s.pursuers + shift for s in settings], estimates, scale))
+            places = [setting.pursuers + shift for setting in settings]
+            won = [summary.success.mean >= 0.5 for summary in found]
+            handles.append(_draw_method(axes, method, places, [value(summary) for summary in found], scale, won))
         if len(settings) < len(SETTINGS):
             absent = ", ".join(str(setting.pursuers) for setting in SETTINGS if setting not in settings)
             missing.append(f"{label(method)}, n = {absent}: not run")
@@ -61,9 +67,14 @@ def _draw_panel(
 
 
 def _draw_method(
-    axes: Axes, method: str, places: Sequence[float], estimates: Sequence[Estimate], scale: float
+    axes: Axes,
+    method: str,
+    places: Sequence[float],
+    estimates: Sequence[Estimate],
+    scale: float,
+    won: Sequence[bool],
 ) -> Artist:
-    """Draw one method's means, joined, with their intervals."""
+    """Draw one method's means with their intervals; those of settings that are won are filled and joined."""
     series = series_of(method)
     colour = rgb(series.colour)
     means = [scale * estimate.mean for estimate in estimates]
@@ -71,8 +82,12 @@ def _draw_method(
         if estimate.interval is not None:
             ends = [scale * end for end in estimate.interval]
             axes.plot([place, place], ends, "_-", color=colour, linewidth=0.9, markersize=5, zorder=3)
-    (line,) = axes.plot(places, means, series.marker, color=colour, markersize=4.5, zorder=4, label=label(method))
+    joined = [mean if has else math.nan for mean, has in zip(means, won, strict=True)]
+    (line,) = axes.plot(places, joined, series.marker, color=colour, markersize=4.5, zorder=4, label=label(method))
     line.set(linestyle="-", linewidth=1.0)
     if series.dashes:
         line.set_dashes(series.dashes)
+    hollow = [(place, mean) for place, mean, has in zip(places, means, won, strict=True) if not has]
+    for place, mean in hollow:
+        axes.plot(place, mean, series.marker, color=colour, markerfacecolor="white", markersize=4.5, zorder=4)
     return line

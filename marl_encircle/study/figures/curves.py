@@ -135,7 +135,8 @@ def draw_figure4(
         write_letter(axes, letter, f"{title}, n = {setting.pursuers}, λ = {setting.speed_ratio:g}")
     all_axes[0].set_ylabel("success S [%]")
     handles = [shown[method] for method in methods if method in shown]
-    put_below(figure, handles, "thick: mean over the training seeds; thin: each seed; shaded: 95 % interval")
+    rounds = "success on the selection rounds by each method's own closure rule"
+    put_below(figure, handles, f"{rounds}; thick: mean of the training seeds, thin: each, shaded: 95 % interval")
     return figure
 
 
