@@ -95,11 +95,11 @@ def test_a_sweep_shows_no_progress_of_what_is_no_learning_curve(tmp_path: Path, 
 
 @pytest.mark.parametrize(
     ("text", "steps"),
-    [("", 0), ("world_steps,success\n", 0), ("world_steps\n400,0.5\n", 400), ("x\n-3\n", 0), ("x\n1e9\n", 0),
-     (f"x\n{'9' * 400}\n", 1000), (f"x\n{'9' * 5000}\n", 0), ("x\n\xff\n", 0)],
+    [("", 0), ("x", 0), ("400,0.5\n", 400), ("2000,0.5\n", 1000), ("-3,0.5\n", 0), ("1e9,0.5\n", 0), ("400,nan\n", 0),
+     (f"{'9' * 400},0.5\n", 0), (f"{'9' * 5000},0.5\n", 0), ("\xff\n", 0)],
 )  # fmt: skip
 def test_a_sweep_shows_no_more_progress_than_there_can_be(tmp_path: Path, text: str, steps: int) -> None:
-    (tmp_path / "progress.csv").write_bytes(text.encode("latin-1"))
+    (tmp_path / "progress.csv").write_bytes(f"world_steps,success\n{text}".encode("latin-1"))
     assert Running("run", tmp_path, 1000).world_steps == steps
 
 

@@ -14,7 +14,8 @@ from marl_encircle import files, locks
 from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import MAX_FILE, run_path
+from marl_encircle.experiments.learning_curve import read_curve
+from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.train import ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 
@@ -38,11 +39,10 @@ class Running(NamedTuple):
     def world_steps(self) -> int:
         """World steps at the latest point of its learning curve; 0 without one, or where it is not this training's."""
         try:
-            lines = files.read_bytes(self.folder / "progress.csv", max_bytes=MAX_FILE).decode().splitlines()
-            steps = int(lines[-1].partition(",")[0])
-        except (ValueError, IndexError):
+            steps = read_curve(self.folder).world_steps
+        except files.DamagedFileError:
             return 0
-        return min(max(steps, 0), self.total)
+        return min(int(steps[-1]), self.total) if len(steps) else 0
 
 
 @dataclass

@@ -6,7 +6,6 @@ All that is known of the trials is in ``OUT/study.db``, for Optuna's own tools t
 one goes on with the trials that were under way.
 """
 
-import csv
 import json
 import time
 from collections import Counter
@@ -23,7 +22,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.records import MAX_FILE, csv_lines
+from marl_encircle.experiments.learning_curve import read_curve
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
@@ -164,16 +163,9 @@ class _Attempt:
 
         :raises DamagedFileError: if its learning curve is none
         """
-        path = self.run(job) / "progress.csv"
-        if not path.exists():
+        if not (self.run(job) / "progress.csv").exists():
             return []
-        try:
-            text = files.read_bytes(path, max_bytes=MAX_FILE).decode()
-            curve = [float(row["success"]) for row in csv.DictReader(csv_lines(text))]
-        except (ValueError, KeyError, TypeError, csv.Error) as error:
-            if isinstance(error, files.DamagedFileError):
-                raise
-            raise files.DamagedFileError(path, f"no learning curve: {str(error)[:200]}") from error
+        curve: list[float] = read_curve(self.run(job)).success.tolist()
         return curve + [0.0] * (length - len(curve)) if self.status(job) == "diverged" else curve
 
 

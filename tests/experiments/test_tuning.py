@@ -87,15 +87,15 @@ class Scripted:
 
     def __init__(self, job: Job, out: Path, success: list[float], killed: list[Path]) -> None:
         self.folder = run_folder(job.config, job.seed, out)
-        self.left, self.text, self.killed = list(success), "world_steps,success\n", killed
+        self.left, self.lines, self.killed = list(success), ["world_steps,success\n"], killed
         files.write_text(self.folder / checkpoint.NAME, "")
 
     def poll(self) -> int | None:
         if self.folder in self.killed:
             return -9
         if self.left:
-            self.text += f"0,{self.left.pop(0)}\n"
-            files.write_text(self.folder / "progress.csv", self.text)
+            self.lines.append(f"{len(self.lines)},{self.left.pop(0)}\n")
+            files.write_text(self.folder / "progress.csv", "".join(self.lines))
         return None
 
     def kill(self) -> None:
@@ -207,7 +207,7 @@ def judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Jud
             if out.name >= "0002":
                 return Scripted(job, out, script(job), judged.killed)
             worker = Trained(job, out)
-            lines = [f"0,{success}\n" for success in GOOD]
+            lines = [f"{point},{success}\n" for point, success in enumerate(GOOD, 1)]
             files.write_text(
                 run_folder(job.config, job.seed, out) / "progress.csv", "".join(["world_steps,success\n", *lines])
             )
@@ -311,6 +311,23 @@ def test_a_training_whose_process_is_killed_is_tried_again(
     (row,) = tune(space, tmp_path / "out", 1, 1).rows
     assert row.state == "complete"
     assert [job.seed for job in started] == [950, 951, 950]
+
+
+@pytest.mark.parametrize("point", ["2,nan", "2,1.5", "1,0.5"], ids=["no number", "no share", "no later step"])
+def test_a_search_refuses_a_damaged_learning_curve(
+    space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, point: str
+) -> None:
+    class Damaged(Trained):
+        def __init__(self, job: Job, out: Path) -> None:
+            super().__init__(job, out)
+            path = run_folder(job.config, job.seed, out) / "progress.csv"
+            files.write_text(path, f"world_steps,success\n1,0.5\n{point}\n")
+
+    monkeypatch.setattr(executors, "_start", Damaged)
+    with pytest.raises(
+        files.DamagedFileError, match=r"seed950/progress\.csv: no learning curve: (success|world_steps) must"
+    ):
+        tune(space, tmp_path / "out", 1, 1)
 
 
 def test_a_search_without_optuna_names_the_extra_and_writes_nothing(

@@ -21,10 +21,11 @@ from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.build import build_policy, load_policy
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import load_grid
+from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.records import Cell, Run, Setting, read_runs
 from marl_encircle.experiments.train import train
 from marl_encircle.replays.replay import Replay, record_round
-from marl_encircle.study.figures.curves import Band, band_of, curve_from_csv
+from marl_encircle.study.figures.curves import Band, band_of
 from marl_encircle.study.paper import label
 from marl_encircle.study.report import replays
 from marl_encircle.study.report.charts import charts, ticks

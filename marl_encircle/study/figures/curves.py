@@ -1,6 +1,5 @@
 """Figure 4: success over training, from the learning curves of runs."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -11,8 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from marl_encircle.drawing.palette import SERIES, Series
+from marl_encircle.experiments.learning_curve import Curve
 from marl_encircle.experiments.metrics import share_interval
-from marl_encircle.experiments.records import Cell, Setting, csv_lines
+from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.study.paper import label
 
@@ -25,15 +25,6 @@ ALL_METHODS = ("ours", "model_b", "ma2019", "model_a", "model_c")
 """In the order of ``SERIES``; others come after them by name."""
 
 SETTINGS = (Setting(1.1, 3, 0), Setting(1.1, 3, 1))
-
-
-class Curve(NamedTuple):
-    """The learning curve of one run. P points."""
-
-    world_steps: NDArray[np.int64]
-    """When the rounds were played, (P,)."""
-    success: Array
-    """Share of them that the method's own rule counts as a success, (P,)."""
 
 
 class Band(NamedTuple):
@@ -55,42 +46,15 @@ class Band(NamedTuple):
         return mean
 
 
-def curve_from_csv(text: str) -> Curve:
-    """Read ``progress.csv``.
-
-    :param text: content of the file
-    :raises ValueError: without points, without the columns ``world_steps`` and ``success``, or for what is no count of
-        steps, rising, or no share in them
-    """
-    steps: list[int] = []
-    shares: list[float] = []
-    try:
-        for row in csv.DictReader(csv_lines(text)):
-            steps.append(int(row["world_steps"]))
-            shares.append(float(row["success"]))
-            if steps[-1] <= max(steps[-2:-1], default=-1):
-                raise ValueError("world_steps must rise from line to line")
-        curve = Curve(np.array(steps, np.int64), np.array(shares))
-    except csv.Error as error:
-        raise ValueError(f"not CSV: {error}") from error
-    except OverflowError as error:
-        raise ValueError("world_steps: too large") from error
-    except (KeyError, TypeError) as error:
-        raise ValueError("world_steps and success must be in every line") from error
-    if not steps:
-        raise ValueError("no points")
-    if not ((curve.success >= 0) & (curve.success <= 1)).all():
-        raise ValueError("success must be between 0 and 1")
-    return curve
-
-
 def band_of(curves: Sequence[Curve], rounds: int) -> Band:
     """Gather the curves of all seeds at the steps that they have in common.
 
     :param curves: one or more
     :param rounds: that were played at each point; see :func:`~marl_encircle.experiments.metrics.share_interval`
-    :raises ValueError: if they have none in common
+    :raises ValueError: for one without points, or if they have none in common
     """
+    if not all(len(curve.world_steps) for curve in curves):
+        raise ValueError("a learning curve without points")
     steps = np.array(sorted(set.intersection(*(set(curve.world_steps.tolist()) for curve in curves))), np.int64)
     if not len(steps):
         raise ValueError("the learning curves of the seeds have no step in common")

@@ -11,13 +11,14 @@ from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.learning_curve import Curve, read_curve
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
-from marl_encircle.experiments.records import MAX_FILE, Cell, Run, read_record, run_path
+from marl_encircle.experiments.records import Cell, Run, read_record, run_path
 from marl_encircle.replays.replay import record_round
 from marl_encircle.study.figures import contributions, curves
 from marl_encircle.study.figures.canvas import encode
 from marl_encircle.study.figures.contributions import draw_figure5
-from marl_encircle.study.figures.curves import ALL_METHODS, Band, band_of, curve_from_csv, draw_figure4
+from marl_encircle.study.figures.curves import ALL_METHODS, Band, band_of, draw_figure4
 from marl_encircle.study.figures.rounds import METHOD, PLACES, Column, Place, choose_round, draw_figure6
 from marl_encircle.study.figures.situations import draw_figure1, draw_figure3
 
@@ -71,25 +72,19 @@ def read_bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
     :param folder: of all runs
     :raises DamagedFileError: for a curve that is not what its run wrote
     """
-    by_cell: dict[Cell, list[curves.Curve]] = {}
+    by_cell: dict[Cell, list[Curve]] = {}
     rounds: dict[Cell, int] = {}
     for run in runs:
         if run.status == "finished":
             path = folder / run_path(run.cell, run.seed)
             record = read_record(path)
-            data = files.read_bytes(
-                path / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE
-            )
-            try:
-                curve = curve_from_csv(data.decode())
-            except ValueError as error:
-                raise files.DamagedFileError(path / "progress.csv", str(error)) from error
+            curve = read_curve(path, record["sha256"].get("progress.csv"))
             by_cell.setdefault(run.cell, []).append(curve)
             rounds[run.cell] = record["config"]["evaluation"]["curve_episodes"]
     return {cell: _band_of(cell, found, rounds[cell], folder) for cell, found in by_cell.items()}
 
 
-def _band_of(cell: Cell, found: Sequence[curves.Curve], rounds: int, folder: Path) -> Band:
+def _band_of(cell: Cell, found: Sequence[Curve], rounds: int, folder: Path) -> Band:
     """Gather the curves of a cell; raise a DamagedFileError that names its folder where they do not fit together."""
     try:
         return band_of(found, rounds)

@@ -1,0 +1,64 @@
+"""The learning curve of a run, ``progress.csv``: what its selection rounds said during the training."""
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_encircle import files
+from marl_encircle.experiments.records import MAX_FILE, csv_lines
+
+
+class Curve(NamedTuple):
+    """The learning curve of one run. P points, none before the first one has been played."""
+
+    world_steps: NDArray[np.int64]
+    """When the rounds were played, rising, (P,)."""
+    success: NDArray[np.float64]
+    """Share of them that the method's own rule counts as a success, (P,)."""
+
+
+def read_curve(folder: Path, sha256: str | None = None) -> Curve:
+    """Read the learning curve in a run folder.
+
+    :param sha256: what the file must hash to, if the run has ended
+    :raises files.DamagedFileError: if it is missing, changed, or none
+    """
+    path = folder / "progress.csv"
+    data = files.read_bytes(path, sha256=sha256, max_bytes=MAX_FILE)
+    try:
+        return curve_from_csv(data.decode())
+    except ValueError as error:
+        raise files.DamagedFileError(path, f"no learning curve: {str(error)[:200]}") from error
+
+
+def curve_from_csv(text: str) -> Curve:
+    """Read ``progress.csv``.
+
+    :param text: content of the file
+    :raises ValueError: without the columns ``world_steps`` and ``success``, or for what is no count of steps, rising,
+        or no share in them
+    """
+    steps: list[int] = []
+    shares: list[float] = []
+    reader = csv.DictReader(csv_lines(text))
+    try:
+        if not {"world_steps", "success"} <= set(reader.fieldnames or ()):
+            raise ValueError("world_steps and success must be among the columns")
+        for row in reader:
+            steps.append(int(row["world_steps"]))
+            shares.append(float(row["success"]))
+            if steps[-1] <= max(steps[-2:-1], default=-1):
+                raise ValueError("world_steps must rise from line to line")
+        curve = Curve(np.array(steps, np.int64), np.array(shares, np.float64))
+    except csv.Error as error:
+        raise ValueError(f"not CSV: {error}") from error
+    except OverflowError as error:
+        raise ValueError("world_steps: too large") from error
+    except TypeError as error:
+        raise ValueError("world_steps and success must be in every line") from error
+    if not ((curve.success >= 0) & (curve.success <= 1)).all():
+        raise ValueError("success must be between 0 and 1")
+    return curve
