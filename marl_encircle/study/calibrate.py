@@ -21,7 +21,7 @@ from marl_encircle.experiments.metrics import summarise_cell
 from marl_encircle.experiments.records import read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.trainable import check_trainings
-from marl_encircle.study.protocol import Changes, Protocol, Result, jobs_of, name_of, paper_cells
+from marl_encircle.study.protocol import Changes, Protocol, SuccessAndLength, cells_with_numbers, jobs_of, name_of
 from marl_encircle.study.typeset import markdown
 
 
@@ -38,7 +38,7 @@ class Trial(NamedTuple):
     """
 
     changes: Changes
-    results: tuple[Result, ...]
+    results: tuple[SuccessAndLength, ...]
     distance: float
 
 
@@ -95,7 +95,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
     """Return the sensitivity table, as Markdown and CSV, and the chosen scenario as YAML: file name -> text."""
     cells, chosen = protocol.cells, calibration.chosen.changes
     rows = [(name_of(trial.changes), trial.results, f"{trial.distance:.2f}") for trial in calibration.trials]
-    rows.append(("the paper", tuple(paper_cells()[cell] for cell in cells), ""))
+    rows.append(("the paper", tuple(cells_with_numbers()[cell] for cell in cells), ""))
     columns = [cell.setting.symbols for cell in cells]
     header = ["Scenario", *(f"S % / MEL at {column}" for column in columns), "Distance"]
     seeds = ", ".join(map(str, protocol.seeds))
@@ -137,7 +137,7 @@ def _measure(protocol: Protocol, changes: Changes, folder: Path) -> Trial:
         )
         # Without any success a round takes its whole time
         length = summary.mean_episode_length
-        result = Result(100 * summary.success.mean, length.mean if length else config.scenario.max_cycles)
-        distance += sum(abs(ours - theirs) for ours, theirs in zip(result, paper_cells()[cell], strict=True))
+        result = SuccessAndLength(100 * summary.success.mean, length.mean if length else config.scenario.max_cycles)
+        distance += sum(abs(ours - theirs) for ours, theirs in zip(result, cells_with_numbers()[cell], strict=True))
         results.append(result)
     return Trial(changes, tuple(results), distance)

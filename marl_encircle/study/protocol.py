@@ -45,7 +45,7 @@ class Protocol(Section):
         return [Cell(self.reward, setting.build()) for setting in self.settings]
 
 
-class Result(NamedTuple):
+class SuccessAndLength(NamedTuple):
     """S [percentage points] and MEL [steps] of a cell."""
 
     success: float
@@ -65,7 +65,7 @@ def load_protocol(name: str) -> Protocol:
     if scenarios > MAX_SCENARIOS:
         raise ConfigError(f"{path}: {scenarios} scenarios; at most {MAX_SCENARIOS} may be tried")
     for cell in protocol.cells:
-        if cell not in paper_cells():
+        if cell not in cells_with_numbers():
             raise ConfigError(f"{path}: the paper has no numbers of {cell.method} in {cell.setting}")
     with naming_file(path):
         _check_distinct(protocol)
@@ -136,10 +136,10 @@ def name_of(changes: Changes) -> str:
 
 
 @cache
-def paper_cells() -> dict[Cell, Result]:
-    """Return the cells for which the paper has numbers."""
+def cells_with_numbers() -> dict[Cell, SuccessAndLength]:
+    """Return the cells for which the paper has both numbers."""
     return {
-        cell: Result(result.success_percent, result.mean_episode_length)
+        cell: SuccessAndLength(result.success_percent, result.mean_episode_length)
         for cell, result in reported_cells().items()
         if result.success_percent is not None and result.mean_episode_length is not None
     }

@@ -17,7 +17,15 @@ from marl_encircle.experiments.trainable import memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import calibrate as calibration
 from marl_encircle.study.calibrate import Trial, calibrate, render
-from marl_encircle.study.protocol import MAX_SCENARIOS, Protocol, Result, jobs_of, load_protocol, name_of, paper_cells
+from marl_encircle.study.protocol import (
+    MAX_SCENARIOS,
+    Protocol,
+    SuccessAndLength,
+    cells_with_numbers,
+    jobs_of,
+    load_protocol,
+    name_of,
+)
 
 ROOT = Path(__file__).parents[2]
 PROTOCOL = """\
@@ -49,7 +57,7 @@ def with_distances(monkeypatch: pytest.MonkeyPatch, distances: Mapping[str, floa
 
     def measure(protocol: Protocol, changes: Mapping[str, Any], folder: Path) -> Trial:
         asked.append(name_of(changes))
-        return Trial(changes, tuple(Result(90.0, 20.0) for _ in protocol.cells), distances[name_of(changes)])
+        return Trial(changes, tuple(SuccessAndLength(90.0, 20.0) for _ in protocol.cells), distances[name_of(changes)])
 
     monkeypatch.setattr(calibration, "sweep", lambda jobs, *_: Progress(total=len(jobs), done=len(jobs)))
     monkeypatch.setattr(calibration, "_measure", measure)
@@ -179,8 +187,8 @@ def test_a_grid_is_no_protocol() -> None:
 
 
 def test_the_papers_cells_are_those_with_numbers() -> None:
-    cells = paper_cells()
-    assert cells[Cell("ours", Setting(1.1, 2, 1))] == Result(77.75, 29.48)
+    cells = cells_with_numbers()
+    assert cells[Cell("ours", Setting(1.1, 2, 1))] == SuccessAndLength(77.75, 29.48)
     assert Cell("model_a", Setting(1.1, 2, 1)) not in cells
 
 
