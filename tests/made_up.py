@@ -7,7 +7,8 @@ from pathlib import Path
 from marl_encircle import files
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments import records
-from marl_encircle.experiments.records import Cell, Closure, Episode, Run, Setting, config_hash
+from marl_encircle.experiments.episodes import Episode, episodes_to_csv
+from marl_encircle.experiments.records import Cell, Closure, Run, Setting, config_hash
 
 SEEDS = world_seeds(1000, 1000)
 """Of the rounds of evaluation seed 1000."""
@@ -62,7 +63,7 @@ def write_run(
     run = folder / records.run_path(cell, seed)
     texts = {"policy.safetensors": f"weights {seed}\n", "progress.csv": "world_steps,success\n0,0.0\n"}
     if episodes is not None:
-        texts["episodes.csv"] = records.episodes_to_csv(episodes)
+        texts["episodes.csv"] = episodes_to_csv(episodes)
     for name, text in texts.items():
         files.write_text(run / name, text)
     config = {

@@ -34,9 +34,10 @@ from marl_encircle.experiments import checkpoint, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.build import load_run, policy_bytes
 from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.episodes import Episode, episodes_from_csv
 from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
-from marl_encircle.experiments.records import Episode, episodes_from_csv, read_runs
+from marl_encircle.experiments.records import read_runs
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.figures.curves import band_of
 

@@ -12,7 +12,8 @@ from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.experiments.build import fit_policy
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import Episode, Setting
+from marl_encircle.experiments.episodes import Episode
+from marl_encircle.experiments.records import Setting
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 WORLDS_AT_ONCE = 100

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle import files
-from marl_encircle.experiments.records import MAX_FILE, csv_lines
+from marl_encircle.experiments.episodes import csv_lines
+from marl_encircle.experiments.records import MAX_FILE
 
 
 class Curve(NamedTuple):

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 
 from marl_encircle.core.geometry import Closure
-from marl_encircle.experiments.records import Episode
+from marl_encircle.experiments.episodes import Episode
 
 CONFIDENCE = 0.95
 UNBOUNDED = (-math.inf, math.inf)

@@ -16,7 +16,8 @@ from pydantic import (
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.rewards import Reward
-from marl_encircle.experiments.records import MAX_ROUNDS, Setting
+from marl_encircle.experiments.episodes import MAX_ROUNDS
+from marl_encircle.experiments.records import Setting
 
 Features = Literal["observation", "relative", "set"]
 Count = Annotated[int, Field(ge=1, le=10**10)]

@@ -18,7 +18,8 @@ from marl_encircle import files
 from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.descriptions import CURVES, describe
-from marl_encircle.experiments.records import MAX_FILE, csv_lines, read_record
+from marl_encircle.experiments.episodes import csv_lines
+from marl_encircle.experiments.records import MAX_FILE, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 

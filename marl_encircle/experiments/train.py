@@ -36,18 +36,11 @@ from marl_encircle.experiments.callbacks import (
 from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
+from marl_encircle.experiments.episodes import Episode, episodes_to_csv
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
-from marl_encircle.experiments.records import (
-    Episode,
-    Setting,
-    config_hash,
-    episodes_name,
-    episodes_to_csv,
-    read_record,
-    run_path,
-)
+from marl_encircle.experiments.records import Setting, config_hash, episodes_name, read_record, run_path
 from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
 from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError

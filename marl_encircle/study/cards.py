@@ -13,10 +13,11 @@ from typing import Any
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.grid import Grid, Job, arguments
 from marl_encircle.experiments.metrics import RunSummary, summarise_run
 from marl_encircle.experiments.pretrained import in_words
-from marl_encircle.experiments.records import Cell, Episode, Run, Setting, read_record, run_path
+from marl_encircle.experiments.records import Cell, Run, Setting, read_record, run_path
 from marl_encircle.study.paper import label
 
 CARD = "README.md"

@@ -6,7 +6,8 @@ from typing import NamedTuple
 from marl_encircle.core.geometry import Closure
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments import metrics
-from marl_encircle.experiments.records import Cell, Episode, Run, Setting, Status
+from marl_encircle.experiments.episodes import Episode
+from marl_encircle.experiments.records import Cell, Run, Setting, Status
 
 OTHER_STATUSES: tuple[Status, ...] = ("diverged", "unfinished", "not evaluated")
 

@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 from marl_encircle import files
 from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.metrics import wilson_interval
 from marl_encircle.experiments.provenance import cpu_model
-from marl_encircle.experiments.records import Cell, Episode, Setting, episodes_name, read_episodes
+from marl_encircle.experiments.records import Cell, Setting, episodes_name, read_episodes
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study.reproduce import render
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from marl_encircle.experiments import metrics
+from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.metrics import Interval
-from marl_encircle.experiments.records import Episode
 
 Shares = NDArray[np.float64]
 

@@ -38,7 +38,8 @@ from marl_encircle.experiments import callbacks, checkpoint, train
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import config_hash, episodes_from_csv, read_record, read_runs
+from marl_encircle.experiments.episodes import episodes_from_csv
+from marl_encircle.experiments.records import config_hash, read_record, read_runs
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, maddpg
 

@@ -8,8 +8,9 @@ from made_up import compress
 from tiny_runs import TINY, copy_of_finished, everything_in
 
 from marl_encircle import files
+from marl_encircle.experiments.episodes import episodes_from_csv, episodes_to_csv
 from marl_encircle.experiments.grid import Grid, Job
-from marl_encircle.experiments.records import Setting, episodes_from_csv, episodes_to_csv
+from marl_encircle.experiments.records import Setting
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study import verify as verification
 from marl_encircle.study.figures.write import write_figures

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from marl_encircle.core.geometry import Closure
 from marl_encircle.drawing.palette import FAINT, INK, OBSTACLE, OBSTACLE_EDGE, PAPER, pursuer_colour
-from marl_encircle.experiments.records import Episode, Setting
+from marl_encircle.experiments.episodes import Episode
+from marl_encircle.experiments.records import Setting
 from marl_encircle.replays.replay import Replay
 from marl_encircle.study.figures.canvas import SMALL, WIDTH, put_below, rgb, say, style, write_letter
 from marl_encircle.study.figures.enclosures import (
