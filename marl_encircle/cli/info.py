@@ -97,11 +97,11 @@ def _run_folders(results: Path) -> list[Path]:
 
 def _runs(folder: Path) -> dict[str, dict[str, int]]:
     """Return how many runs of each method have which end."""
-    from marl_encircle.experiments.records import read_record
+    from marl_encircle.experiments.records import RECORD, read_record
     from marl_encircle.files import DamagedFileError
 
     ends: dict[str, Counter[str]] = {}
-    for path in sorted(folder.glob("*/*/seed*/run.json")):
+    for path in sorted(folder.glob(f"*/*/seed*/{RECORD}")):
         try:
             status = read_record(path.parent)["status"]
         except DamagedFileError:

@@ -114,10 +114,10 @@ def _thumbnails(quiet: bool) -> "Draw | None":
 def _outcome(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
     """Return what became of a run; one that diverged has no rounds, and so no success."""
     from marl_encircle.experiments.metrics import summarise_run
-    from marl_encircle.experiments.records import read_episodes
+    from marl_encircle.experiments.records import episodes_name, read_episodes
 
     success = length = None
-    if "episodes.csv" in record["sha256"]:
+    if episodes_name() in record["sha256"]:
         own = summarise_run(read_episodes(folder, record), record["config"]["reward"]["closure"])
         success, length = own.success, own.mean_episode_length
     return {
@@ -166,6 +166,7 @@ def evaluate(
     from marl_encircle.experiments.build import load_run
     from marl_encircle.experiments.evaluate import play_rounds
     from marl_encircle.experiments.metrics import summarise_run
+    from marl_encircle.experiments.records import POLICY
     from marl_encircle.experiments.train import write_episodes
 
     policy, config, record = load_run(run_dir)
@@ -202,7 +203,7 @@ def evaluate(
         "success_all": summarise_run(rounds, "all").success,
         "success_pursuers": summarise_run(rounds, "pursuers").success,
         "sigma_c": own.sigma_c,
-        "policy_sha256": record["sha256"]["policy.safetensors"],
+        "policy_sha256": record["sha256"][POLICY],
     }
     if write:
         write_episodes(run_dir, rounds)

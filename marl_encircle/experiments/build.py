@@ -24,7 +24,7 @@ from marl_encircle.experiments.choices import Engine, Profile
 from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
 from marl_encircle.experiments.pretrained import find_run, in_words, is_run_path, pretrained_runs, setting_of
-from marl_encircle.experiments.records import POLICY, read_record
+from marl_encircle.experiments.records import POLICY, RECORD, read_record
 from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -325,4 +325,4 @@ def config_of(record: dict[str, Any], folder: Path) -> Config:
     try:
         return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
     except (ValueError, RecursionError) as error:
-        raise files.DamagedFileError(folder / "run.json", f"config: {str(error)[:500]}") from error
+        raise files.DamagedFileError(folder / RECORD, f"config: {str(error)[:500]}") from error

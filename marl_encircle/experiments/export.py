@@ -27,7 +27,7 @@ from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.choices import ExportFormat
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.records import run_path
+from marl_encircle.experiments.records import POLICY, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -122,7 +122,7 @@ def describe(policy: MADDPGPolicy, config: Config, record: dict[str, Any]) -> di
         "train_seed": record["seed"],
         "status": record["status"],
         "config_hash": record["config_hash"],
-        "policy_sha256": record["sha256"]["policy.safetensors"],
+        "policy_sha256": record["sha256"][POLICY],
         "marl_encircle": metadata.version("marl-encircle"),
     }
 

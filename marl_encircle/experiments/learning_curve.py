@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from marl_encircle import files
 from marl_encircle.experiments.episodes import csv_lines
-from marl_encircle.experiments.records import MAX_FILE
+from marl_encircle.experiments.records import CURVE, MAX_FILE
 
 
 class Curve(NamedTuple):
@@ -27,7 +27,7 @@ def read_curve(folder: Path, sha256: str | None = None) -> Curve:
     :param sha256: what the file must hash to, if the run has ended
     :raises files.DamagedFileError: if it is missing, changed, or none
     """
-    path = folder / "progress.csv"
+    path = folder / CURVE
     data = files.read_bytes(path, sha256=sha256, max_bytes=MAX_FILE)
     try:
         return curve_from_csv(data.decode())

@@ -14,7 +14,7 @@ from marl_encircle.core.scenes import SCENES
 from marl_encircle.experiments.faults import explain
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.library import PACKAGE, reward_names
-from marl_encircle.experiments.records import Cell, Setting, read_record, read_setting, run_path
+from marl_encircle.experiments.records import RECORD, Cell, Setting, read_record, read_setting, run_path
 from marl_encircle.experiments.sections import SettingConfig
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.spelling import nearest
@@ -32,7 +32,7 @@ def pretrained_runs() -> Path:
 def is_run_path(what: str) -> bool:
     """Whether a path is meant rather than the name of a method."""
     path = Path(what)
-    return len(path.parts) > 1 or path.is_file() or (path / "run.json").exists()
+    return len(path.parts) > 1 or path.is_file() or (path / RECORD).exists()
 
 
 def setting_of(fields: Mapping[str, Any]) -> Setting:
@@ -64,7 +64,7 @@ def find_run(method: str, setting: Setting, folders: Sequence[Path]) -> Path:
     found = _run_of_sets(method, folders)
     if found is not None:
         return found
-    there = {path.parents[1] for folder in folders for path in (folder / method).glob("*/seed*/run.json")}
+    there = {path.parents[1] for folder in folders for path in (folder / method).glob(f"*/seed*/{RECORD}")}
     known = "it has none at all"
     if there:
         closest = min(map(read_setting, sorted(there)), key=lambda other: _distance(other, setting))
@@ -109,7 +109,7 @@ def _run_of_sets(method: str, folders: Sequence[Path]) -> Path | None:
     :raises ConfigError: if it diverged
     """
     for folder in folders:
-        for path in sorted({path.parents[1] for path in (folder / method).glob("*/seed*/run.json")}):
+        for path in sorted({path.parents[1] for path in (folder / method).glob(f"*/seed*/{RECORD}")}):
             cell = Cell(method, read_setting(path))
             first = _first_seed(folder, cell)
             algorithm = read_record(first)["config"].get("algorithm") if first else None
@@ -130,7 +130,7 @@ def in_words(setting: Setting) -> str:
 def _first_seed(folder: Path, cell: Cell) -> Path | None:
     numbers = [
         int(number)
-        for path in (folder / run_path(cell, 0)).parent.glob("seed*/run.json")
+        for path in (folder / run_path(cell, 0)).parent.glob(f"seed*/{RECORD}")
         if (number := path.parent.name.removeprefix("seed")).isdigit()
     ]
     return folder / run_path(cell, min(numbers)) if numbers else None

@@ -12,8 +12,15 @@ from marl_encircle.core.geometry import Closure
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.experiments.episodes import Episode, episodes_from_csv
 
+RECORD = "run.json"
+"""What a run folder says of its run; written last."""
+CURVE = "progress.csv"
+"""The learning curve in a run folder."""
 POLICY = "policy.safetensors"
 """The actors' weights in a run folder."""
+
+SCHEMA = 1
+"""Which fields a record has; another number is for another version of this package."""
 
 Status = Literal["finished", "diverged", "unfinished", "not evaluated"]
 MAX_RUN_JSON = 1 << 20
@@ -145,10 +152,10 @@ def _check_spelling(folder: Path, name: str) -> None:
 
 def _read_run(folder: Path, cell: Cell, seed: int, policies: bool) -> Run:
     """Read one run folder; without ``run.json``, which is written last, the run is unfinished."""
-    if not (folder / "run.json").exists():
+    if not (folder / RECORD).exists():
         return Run(cell, seed, "unfinished")
     record = read_record(folder)
-    _check_place(folder / "run.json", record, cell, seed)
+    _check_place(folder / RECORD, record, cell, seed)
     closure: Closure = record["config"]["reward"]["closure"]
     hashes = sorted(record["sha256"].items())
     if not policies:
@@ -156,12 +163,13 @@ def _read_run(folder: Path, cell: Cell, seed: int, policies: bool) -> Run:
     contents = {name: files.read_bytes(folder / name, sha256=value, max_bytes=MAX_FILE) for name, value in hashes}
     if record["status"] == "diverged":
         return Run(cell, seed, "diverged", closure)
-    if "episodes.csv" not in contents:
-        if files.is_kept(folder / "episodes.csv"):
-            raise files.DamagedFileError(folder / "episodes.csv", "its hash is not in run.json")
+    own = folder / episodes_name()
+    if own.name not in contents:
+        if files.is_kept(own):
+            raise files.DamagedFileError(own, f"its hash is not in {RECORD}")
         return Run(cell, seed, "not evaluated", closure)
     asked = record["config"]["evaluation"]
-    episodes = _episodes_of(folder / "episodes.csv", contents["episodes.csv"], asked)
+    episodes = _episodes_of(own, contents[own.name], asked)
     elsewhere = {}
     for name in contents:
         setting = _setting_of(name.removeprefix("episodes_").removesuffix(".csv"))
@@ -223,7 +231,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
     :raises files.DamagedFileError: if it is missing (the run is unfinished), changed, or not what a run writes
     """
-    path = folder / "run.json"
+    path = folder / RECORD
     data = files.read_bytes(path, max_bytes=MAX_RUN_JSON)
     try:
         record = json.loads(data)
@@ -244,6 +252,8 @@ def _fault(record: Any) -> str | None:
     """Say what is wrong with the content of a ``run.json``; None if nothing is."""
     if not isinstance(record, dict):
         return "not a JSON object"
+    if record.get("schema") != SCHEMA:
+        return f"schema is {record.get('schema')!r:.80}, not {SCHEMA}: no record that this version can read"
     missing = [key for key in _RECORD_KEYS if key not in record]
     if missing:
         return f"missing {', '.join(missing)}"

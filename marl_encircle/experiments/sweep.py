@@ -15,7 +15,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.learning_curve import read_curve
-from marl_encircle.experiments.records import run_path
+from marl_encircle.experiments.records import RECORD, run_path
 from marl_encircle.experiments.train import ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 
@@ -117,7 +117,7 @@ def sweep(
     """
     executor = executor or LocalExecutor()
     if isinstance(executor, LocalExecutor):
-        missing = [job for job in jobs if not (run_folder(job.config, job.seed, out) / "run.json").exists()]
+        missing = [job for job in jobs if not (run_folder(job.config, job.seed, out) / RECORD).exists()]
         check_trainings([job.config for job in missing], n_workers)
     with locks.folder_lock(out):
         progress = Progress(len(jobs), n_workers)

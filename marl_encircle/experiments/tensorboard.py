@@ -19,7 +19,7 @@ from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.descriptions import CURVES, describe
 from marl_encircle.experiments.episodes import csv_lines
-from marl_encircle.experiments.records import MAX_FILE, read_record
+from marl_encircle.experiments.records import CURVE, MAX_FILE, RECORD, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -172,7 +172,7 @@ def gather(runs: Path, folder: Path) -> Shown:
             shown.parent.mkdir(parents=True, exist_ok=True)
             shown.symlink_to((run / "tensorboard").resolve(), target_is_directory=True)
             own += 1
-        elif (run / "run.json").exists():
+        elif (run / RECORD).exists():
             _write_curve(run, shown)
             recorded += 1
     return Shown(recorded, own)
@@ -184,7 +184,7 @@ def _write_curve(run: Path, folder: Path) -> None:
 
     record = read_record(run)
     config = config_of(record, run)
-    data = files.read_bytes(run / "progress.csv", sha256=record["sha256"].get("progress.csv"), max_bytes=MAX_FILE)
+    data = files.read_bytes(run / CURVE, sha256=record["sha256"].get(CURVE), max_bytes=MAX_FILE)
     with SummaryWriter(folder) as writer:
         describe(writer, config, record["seed"], CURVES)
         try:
@@ -194,4 +194,4 @@ def _write_curve(run: Path, folder: Path) -> None:
                     if value:
                         writer.add_scalar(f"eval/{name}", float(value), steps)
         except (ValueError, KeyError, TypeError, csv.Error) as error:
-            raise files.DamagedFileError(run / "progress.csv", f"no learning curve: {str(error)[:200]}") from error
+            raise files.DamagedFileError(run / CURVE, f"no learning curve: {str(error)[:200]}") from error

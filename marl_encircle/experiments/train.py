@@ -40,12 +40,21 @@ from marl_encircle.experiments.episodes import Episode, episodes_to_csv
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
-from marl_encircle.experiments.records import Setting, config_hash, episodes_name, read_record, run_path
+from marl_encircle.experiments.records import (
+    CURVE,
+    POLICY,
+    RECORD,
+    SCHEMA,
+    Setting,
+    config_hash,
+    episodes_name,
+    read_record,
+    run_path,
+)
 from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
 from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError
 
-SCHEMA = 1
 ROUNDS_PER_LOG = 500
 
 logger = logging.getLogger(__name__)
@@ -136,7 +145,7 @@ class _Run:
             events = EventFiles(folder, self.config, self.plan["seed"], steps, draw)
         model.set_logger(Logger(None, [events] if events else []))
         add_pictures = events.add_pictures if events else None
-        curve = LearningCurve(self.config, curriculum, self.folder / "progress.csv", self.rows, add_pictures)
+        curve = LearningCurve(self.config, curriculum, self.folder / CURVE, self.rows, add_pictures)
         guard = DivergenceGuard(self.plan, self.folder / divergence.NAME)
         callbacks: list[BaseCallback] = [RoundLogger(curriculum), guard, curve]
         bar = ProgressBar(
@@ -196,16 +205,16 @@ class _Run:
         :raises Stopped: if there is one after the rounds; nothing is written then
         """
         wall, cpu = self.seconds()
-        contents = {"policy.safetensors": policy_bytes(self.model.policy)}
+        contents = {POLICY: policy_bytes(self.model.policy)}
         if status == "finished":
             e = self.config.evaluation
             episodes = play_rounds(self.model.policy, self.config, e.episodes, e.seed)
             if caught:
                 raise Stopped(caught[0])
-            contents["episodes.csv"] = episodes_to_csv(episodes).encode()
+            contents[episodes_name()] = episodes_to_csv(episodes).encode()
         for name, data in contents.items():
             files.write_bytes(self.folder / name, data)
-        contents["progress.csv"] = (self.folder / "progress.csv").read_bytes()
+        contents[CURVE] = (self.folder / CURVE).read_bytes()
         record = {
             "schema": SCHEMA,
             "status": status,
@@ -224,7 +233,7 @@ class _Run:
             "updates": self.model._n_updates,
             "sha256": {name: files.sha256_bytes(data) for name, data in sorted(contents.items())},
         }
-        files.write_json(self.folder / "run.json", record)
+        files.write_json(self.folder / RECORD, record)
         if status == "finished":
             checkpoint.remove(self.folder)
 
@@ -239,7 +248,7 @@ def write_episodes(folder: Path, episodes: list[Episode], setting: Setting | Non
     record["sha256"] = dict(sorted({**record["sha256"], name: files.sha256_bytes(data)}.items()))
     files.write_bytes(folder / name, data)
     files.remove(files.compressed(folder / name))
-    files.write_json(folder / "run.json", record)
+    files.write_json(folder / RECORD, record)
 
 
 def ended_run(folder: Path, config: Config, seed: int, engine: Engine | None = None) -> dict[str, Any] | None:
@@ -250,7 +259,7 @@ def ended_run(folder: Path, config: Config, seed: int, engine: Engine | None = N
     :param engine: None: either will do, since both train the same policy
     :raises OtherRunError: if it is of another configuration, seed or engine
     """
-    if not (folder / "run.json").exists():
+    if not (folder / RECORD).exists():
         return None
     record = read_record(folder)
     check_same_run(folder, config, seed, engine or record.get("engine", "native"))

@@ -23,6 +23,7 @@ from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.learning_curve import read_curve
+from marl_encircle.experiments.records import CURVE
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
@@ -163,7 +164,7 @@ class _Attempt:
 
         :raises DamagedFileError: if its learning curve is none
         """
-        if not (self.run(job) / "progress.csv").exists():
+        if not (self.run(job) / CURVE).exists():
             return []
         curve: list[float] = read_curve(self.run(job)).success.tolist()
         return curve + [0.0] * (length - len(curve)) if self.status(job) == "diverged" else curve

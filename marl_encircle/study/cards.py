@@ -17,7 +17,7 @@ from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.grid import Grid, Job, arguments
 from marl_encircle.experiments.metrics import RunSummary, summarise_run
 from marl_encircle.experiments.pretrained import in_words
-from marl_encircle.experiments.records import Cell, Run, Setting, read_record, run_path
+from marl_encircle.experiments.records import POLICY, Cell, Run, Setting, read_record, run_path
 from marl_encircle.study.paper import label
 
 CARD = "README.md"
@@ -117,7 +117,7 @@ def _facts(record: Mapping[str, Any], config: Config, summary: RunSummary) -> st
         "training seed": record["seed"],
         "training": f"{config.training.world_steps:,} world steps in {config.training.n_worlds} worlds",
         "configuration": f"sha256 `{record['config_hash']}`",
-        "policy.safetensors": f"sha256 `{record['sha256']['policy.safetensors']}`",
+        POLICY: f"sha256 `{record['sha256'][POLICY]}`",
     }
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows.items())])
 

@@ -11,7 +11,7 @@ from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
-from marl_encircle.experiments.records import episodes_name, read_record, read_runs
+from marl_encircle.experiments.records import RECORD, episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
@@ -53,7 +53,7 @@ def reproduce(
     evaluated = 0
     for job in grid.jobs:
         folder = run_folder(job.config, job.seed, runs)
-        if not (folder / "run.json").exists():
+        if not (folder / RECORD).exists():
             continue
         hashes = read_record(folder)["sha256"]
         settings = (None, *grid.elsewhere.get(job.config.cell, ()))

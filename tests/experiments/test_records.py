@@ -170,6 +170,8 @@ def test_rounds_that_nobody_vouches_for_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        (lambda record: record.update(schema=2), "schema is 2, not 1: no record that this version can read"),
+        (lambda record: record.pop("schema"), "schema is None, not 1"),
         *((lambda record, key=key: record.pop(key), f"missing {key}") for key in KEYS),
         (lambda record: [record.pop(key) for key in KEYS], f"missing {', '.join(KEYS)}"),
         (lambda record: record.update(status="done"), "status is 'done', not finished or diverged"),

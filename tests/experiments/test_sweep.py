@@ -43,6 +43,7 @@ def record_text(status: str = "finished") -> str:
     config = JOBS[0].config
     return json.dumps(
         {
+            "schema": 1,
             "status": status,
             "method": "ours",
             "config": config.to_dict(),

@@ -13,7 +13,7 @@ from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.learning_curve import Curve, read_curve
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
-from marl_encircle.experiments.records import Cell, Run, read_record, run_path
+from marl_encircle.experiments.records import CURVE, Cell, Run, read_record, run_path
 from marl_encircle.replays.replay import record_round
 from marl_encircle.study.figures import contributions, curves
 from marl_encircle.study.figures.canvas import encode
@@ -78,7 +78,7 @@ def read_bands(runs: Sequence[Run], folder: Path) -> dict[Cell, Band]:
         if run.status == "finished":
             path = folder / run_path(run.cell, run.seed)
             record = read_record(path)
-            curve = read_curve(path, record["sha256"].get("progress.csv"))
+            curve = read_curve(path, record["sha256"].get(CURVE))
             by_cell.setdefault(run.cell, []).append(curve)
             rounds[run.cell] = record["config"]["evaluation"]["curve_episodes"]
     return {cell: _band_of(cell, found, rounds[cell], folder) for cell, found in by_cell.items()}
