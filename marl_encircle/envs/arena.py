@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from marl_encircle.core.observations import bounds, observe
@@ -13,6 +14,20 @@ from marl_encircle.core.simulator import Simulator
 
 ACTION_SIZE = 2
 """U: an acceleration, or a velocity in first-order dynamics, along x and y."""
+
+
+class Spaces(NamedTuple):
+    """What a pursuer may see and do."""
+
+    observation: Box
+    """(O,)."""
+    action: Box
+    """(2,), in [-1, 1]."""
+
+
+def spaces_of(scenario: Scenario) -> Spaces:
+    """Return the spaces of a scenario's pursuers, in objects of their own."""
+    return Spaces(Box(*bounds(scenario)), Box(-1.0, 1.0, (ACTION_SIZE,)))
 
 
 class Outcome(NamedTuple):
@@ -40,12 +55,12 @@ class Arena:
         self.scenario, self.reward = scenario, reward
         self.simulator = Simulator(scenario, n_worlds)
         self.rounds = Rounds(scenario, reward.closure, n_worlds)
-        self.low, self.high = bounds(scenario)
+        self._size = len(bounds(scenario)[0])
         self._everywhere = np.arange(n_worlds)
 
     def observe(self) -> NDArray[np.float32]:
         """Return what all pursuers see now, (B, N, O)."""
-        observations = np.empty((self.simulator.n_worlds, self.scenario.pursuers, len(self.low)), np.float32)
+        observations = np.empty((self.simulator.n_worlds, self.scenario.pursuers, self._size), np.float32)
         observe(self.simulator, observations, self._everywhere)
         return observations
 

@@ -17,7 +17,7 @@ from pettingzoo.utils.conversions import parallel_to_aec, parallel_to_aec_wrappe
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty, Simulator
-from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.envs.arena import ACTION_SIZE, Arena, spaces_of
 from marl_encircle.spelling import nearest
 
 Array = NDArray[np.float32]
@@ -103,13 +103,8 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         self.possible_agents = list(scenario.agents)
         self.agents: list[str] = []
         self._arena = Arena(scenario, reward, n_worlds=1)
-        # One space object each, so that seeding one agent's samples leaves the others' alone.
-        self._observation_spaces: dict[str, Space[Any]] = {
-            agent: Box(self._arena.low, self._arena.high) for agent in self.possible_agents
-        }
-        self._action_spaces: dict[str, Space[Any]] = {
-            agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.possible_agents
-        }
+        # Space objects of each agent's own, so that seeding one agent's samples leaves the others' alone.
+        self._spaces = {agent: spaces_of(scenario) for agent in self.possible_agents}
         self.state_space = _state_space(scenario)
 
     @property
@@ -119,11 +114,13 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
 
     def observation_space(self, agent: str) -> Space[Array]:
         """Return the space of what an agent sees."""
-        return self._observation_spaces[agent]
+        space: Space[Any] = self._spaces[agent].observation
+        return space
 
     def action_space(self, agent: str) -> Space[Array | None]:
         """Return the space of what an agent may do."""
-        return self._action_spaces[agent]
+        space: Space[Any] = self._spaces[agent].action
+        return space
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
         """Change speed ratio, safety distance or obstacle radius from the next round on."""

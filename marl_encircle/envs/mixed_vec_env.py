@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from marl_encircle.core.observations import bounds, layout
+from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty, world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE
+from marl_encircle.envs.arena import ACTION_SIZE, spaces_of
 from marl_encircle.envs.slot_vec_env import SlotVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 
@@ -56,9 +55,9 @@ class MixedVecEnv(SlotVecEnv):
             _Part(EncirclementVecEnv(s, reward, each), slice(i * each, (i + 1) * each), _columns(s, largest))
             for i, s in enumerate(scenarios)
         ]
-        low, high = bounds(largest)
-        self._size = len(low)
-        super().__init__(n_worlds * self.n_agents, spaces.Box(low, high), spaces.Box(-1.0, 1.0, (ACTION_SIZE,)))
+        spaces = spaces_of(largest)
+        (self._size,) = spaces.observation.shape
+        super().__init__(n_worlds * self.n_agents, *spaces)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Give every world its own random stream: ``world_seeds(seed, P)[p]`` is the seed of the worlds of part p of P.
@@ -96,8 +95,9 @@ class MixedVecEnv(SlotVecEnv):
         :raises RuntimeError: if no round is running
         """
         actions = np.asarray(actions)
-        if actions.shape != (self.num_envs, ACTION_SIZE):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 2), one row a slot; got {actions.shape}")
+        shape = (self.num_envs, ACTION_SIZE)
+        if actions.shape != shape:
+            raise ValueError(f"actions must have shape {shape}, one row a slot; got {actions.shape}")
         by_world = actions.reshape(self.n_worlds, self.n_agents, ACTION_SIZE)
         for env, worlds, _ in self._parts:
             env.step_async(by_world[worlds, : env.n_agents].reshape(-1, ACTION_SIZE))

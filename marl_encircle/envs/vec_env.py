@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty, world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.envs.arena import ACTION_SIZE, Arena, spaces_of
 from marl_encircle.envs.slot_vec_env import SlotVecEnv
 
 
@@ -45,11 +44,7 @@ class EncirclementVecEnv(SlotVecEnv):
         self._running = False
         self._arena = Arena(self.scenario, self.reward, n_worlds)
         self.simulator, self.rounds = self._arena.simulator, self._arena.rounds
-        super().__init__(
-            num_envs=n_worlds * self.n_agents,
-            observation_space=spaces.Box(self._arena.low, self._arena.high),
-            action_space=spaces.Box(-1.0, 1.0, (ACTION_SIZE,)),
-        )
+        super().__init__(n_worlds * self.n_agents, *spaces_of(self.scenario))
         if seed is not None:
             self.seed(seed)
 
@@ -90,9 +85,10 @@ class EncirclementVecEnv(SlotVecEnv):
             raise RuntimeError("no round is running: call reset() first")
         with np.errstate(over="ignore"):  # too large for single precision is infinite, and told by name in step_wait
             actions = np.array(actions, np.float32)
-        if actions.shape != (self.num_envs, 2):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 2), one row a slot; got {actions.shape}")
-        self._actions = actions.reshape(self.n_worlds, self.n_agents, 2)
+        shape = (self.num_envs, ACTION_SIZE)
+        if actions.shape != shape:
+            raise ValueError(f"actions must have shape {shape}, one row a slot; got {actions.shape}")
+        self._actions = actions.reshape(self.n_worlds, self.n_agents, ACTION_SIZE)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Move all worlds by one step; worlds whose round ended start the next one.

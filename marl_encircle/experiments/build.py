@@ -8,14 +8,13 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import safetensors.torch
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from marl_encircle import files
-from marl_encircle.core.observations import bounds
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
+from marl_encircle.envs.arena import spaces_of
 from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
 from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -182,11 +181,9 @@ class NoiseSchedule:
 
 def build_policy(config: Config) -> MADDPGPolicy:
     """Return an untrained policy for a configuration's scenario, to load actors into; its critics are of no use."""
-    low, high = bounds(config.scenario)
     algorithm: AlgorithmConfig = config.algorithm
     policy = MADDPGPolicy(
-        spaces.Box(low, high),
-        spaces.Box(-1.0, 1.0, (2,)),
+        *spaces_of(config.scenario),
         lambda _: algorithm.learning_rate,
         n_agents=config.scenario.pursuers,
         critic="shared",

@@ -1,10 +1,12 @@
 """The step that all engines share."""
 
 import numpy as np
+from gymnasium.spaces import Box
 
+from marl_encircle.core.observations import bounds
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.envs.arena import Arena
+from marl_encircle.envs.arena import Arena, spaces_of
 
 
 def test_an_outcome_stays_as_it_was() -> None:
@@ -33,3 +35,13 @@ def test_no_world_is_both_terminated_and_truncated() -> None:
     assert np.array_equal(outcome.terminated, ~outcome.truncated)
     assert outcome.terminated.any()
     assert outcome.truncated.any()
+
+
+def test_a_pursuer_sees_within_its_bounds_and_acts_along_two_axes() -> None:
+    scenario = Scenario(pursuers=4, obstacles=2)
+    spaces = spaces_of(scenario)
+    low, high = bounds(scenario)
+    assert np.array_equal(spaces.observation.low, low)
+    assert np.array_equal(spaces.observation.high, high)
+    assert spaces.action == Box(-1.0, 1.0, (2,), np.float32)
+    assert spaces.observation is not spaces_of(scenario).observation
