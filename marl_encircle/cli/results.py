@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from marl_encircle.cli.options import Address, AsJson, ExecutorOption, GridOption, Jobs, Quiet, Results, make_executor
 from marl_encircle.cli.printing import exit_if_failed
-from marl_encircle.experiments.yaml_files import ConfigError
 
 if TYPE_CHECKING:
     from marl_encircle.experiments.grid import Grid
@@ -35,10 +34,8 @@ def figures(grid: GridOption = "committed", out: Results = Path("results")) -> N
     from marl_encircle.experiments.grid import load_grid
 
     wanted = load_grid(grid)
-    try:
-        from marl_encircle.study.figures.write import write_figures
-    except ImportError as error:
-        raise ConfigError(str(error)) from error
+    from marl_encircle.study.figures.write import write_figures
+
     _warn_of_no_runs(wanted, out)
     for path in write_figures(wanted, out):
         typer.echo(str(path))
@@ -97,11 +94,8 @@ def verify_results(
     wanted = load_grid(grid)
     from marl_encircle.study.verify import verify
 
-    try:
-        with tqdm(unit="run", disable=quiet) as bar:
-            found = verify(wanted, out, lambda done, total: _advance(bar, done, total))
-    except ImportError as error:
-        raise ConfigError(str(error)) from error
+    with tqdm(unit="run", disable=quiet) as bar:
+        found = verify(wanted, out, lambda done, total: _advance(bar, done, total))
     if not found.rounds:
         typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
         raise typer.Exit(3)

@@ -54,7 +54,6 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     :param results: folder of ``runs/``, ``tables/`` and ``figures/``
     :param report: called with the number of runs verified and of all
     :raises DamagedFileError: if a run is not what its record says
-    :raises ImportError: if there are figures and no Matplotlib
     """
     texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]

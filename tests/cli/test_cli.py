@@ -406,19 +406,6 @@ def test_train_without_tensorboard_ends_with_2_and_leaves_nothing(
     assert "Traceback" not in done.err
 
 
-def test_figures_without_matplotlib_end_with_2_and_what_to_install(
-    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for name in [name for name in sys.modules if name.startswith("marl_encircle.study.figures")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    before = everything_in(tmp_path)
-    done = run("figures", "--grid", "smoke")
-    assert (done.code, done.out) == (2, "")
-    assert done.err == "error: figures need Matplotlib: pip install 'matplotlib>=3.9'\n"
-    assert everything_in(tmp_path) == before
-
-
 @pytest.mark.parametrize("name", ["tables", "figures", "report"])
 def test_a_folder_without_runs_of_the_grid_is_warned_of(run: Run, tmp_path: Path, name: str) -> None:
     done = run(name, "--grid", "smoke", "--out", tmp_path / "mistyped")

@@ -18,10 +18,9 @@ shared: []
 """
 RUN = "runs/ours/ratio1.1_n3_m1_random/seed0"
 SWEPT = ["--grid", "grid.yaml", "--out", "swept"]
-HIDDEN = "tensorboard torch.utils.tensorboard matplotlib pygame PIL imageio imageio_ffmpeg onnx onnxruntime ray optuna"
+HIDDEN = "tensorboard torch.utils.tensorboard pygame PIL imageio imageio_ffmpeg onnx onnxruntime ray optuna"
 REFUSALS = {
     "train": ([*tiny_arguments("--out", "other", "--quiet")], "pip install 'tensorboard"),
-    "figures": (SWEPT, "pip install 'matplotlib"),
     "watch": ([RUN, "--headless", "pictures"], "pip install 'marl-encircle[render]'"),
     "export": ([RUN], "pip install 'marl-encircle[export]'"),
     "sweep": (["grid.yaml", "--out", "other", "--executor", "ray"], "pip install 'marl-encircle[cluster]'"),
