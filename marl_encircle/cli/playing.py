@@ -29,7 +29,10 @@ def play_with_command(
     ] = False,
     n_worlds: Annotated[int, typer.Option(min=1, max=1024, metavar="N", help="Worlds that are stepped in turn.")] = 8,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, metavar="SEED", help="Training seed.")] = 0,
-    rounds: Annotated[int, typer.Option(min=2, max=10**5, metavar="N", help="Rounds of the evaluation.")] = 100,
+    episodes: Annotated[
+        int,
+        typer.Option("--episodes", "--rounds", min=2, max=10**5, metavar="N", help="Rounds of the evaluation."),
+    ] = 100,
     save: Annotated[
         Path | None,
         typer.Option(
@@ -53,7 +56,7 @@ def play_with_command(
     world = find_world(env, given, pad)
     started = time.monotonic()
     played = play_with(
-        env, world, algorithm, world_steps, n_worlds=n_worlds, seed=seed, rounds=rounds, progress_bar=not quiet
+        env, world, algorithm, world_steps, n_worlds=n_worlds, seed=seed, rounds=episodes, progress_bar=not quiet
     )
     about = {"environment": env, "arguments": given, "pad": pad, "algorithm": algorithm, "seed": seed}
     if save is not None:
@@ -61,11 +64,11 @@ def play_with_command(
     summary = played.summary()
     if as_json:
         results = {name: {"mean": mean, "interval": interval} for name, (mean, interval) in summary.items()}
-        typer.echo(json.dumps({**about, "world_steps": played.world_steps, "rounds": rounds, **results}))
+        typer.echo(json.dumps({**about, "world_steps": played.world_steps, "rounds": episodes, **results}))
         return
     seconds = time.monotonic() - started
     typer.echo(f"{env}: {len(played.agents)} agents, {played.world_steps:,} world steps, {seconds:.0f} s")
-    typer.echo(f"mean return of {rounds} rounds, mean of the agents [95 % interval over the rounds]")
+    typer.echo(f"mean return of {episodes} rounds, mean of the agents [95 % interval over the rounds]")
     for name, (mean, interval) in summary.items():
         label = algorithm if name == "trained" else name
         typer.echo(f"  {label:<10}  {mean:10.2f}  [{interval.low:.2f}, {interval.high:.2f}]" if interval else label)

@@ -15,7 +15,7 @@ MAX_LINE = 10_000
 
 
 class Episode(NamedTuple):
-    """One evaluation round, a row of ``episodes.csv``.
+    """An evaluation round, a row of ``episodes.csv``; the files and SB3 say episode.
 
     :param round: number of the round within its evaluation
     :param seed: seed the world was reset with

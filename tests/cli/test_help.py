@@ -155,7 +155,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     if arguments[0] == "export" and "--to" not in arguments:
         pytest.importorskip("onnxscript")
     if arguments[0] == "play-with":
-        arguments += ["--world-steps", "200", "--rounds", "5"]
+        arguments += ["--world-steps", "200", "--episodes", "5"]
     if arguments[0] == "verify-results":
         assert checkout("reproduce-tables", "--grid", "smoke").code == 0
     done = checkout(*arguments)

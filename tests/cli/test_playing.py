@@ -10,7 +10,7 @@ from tiny_runs import Done
 from marl_encircle.experiments.play_with import load_played
 
 Run = Callable[..., Done]
-SHORT = ("--world-steps", "200", "--rounds", "10")
+SHORT = ("--world-steps", "200", "--episodes", "10")
 SPREAD = ("mpe2.simple_spread_v3", "--set", "continuous_actions=true")
 
 
@@ -29,12 +29,12 @@ def test_both_means_are_printed_with_their_intervals(run: Run) -> None:
 
 def test_a_script_gets_one_object_and_the_policy(run: Run, tmp_path: Path) -> None:
     arguments = ("--algorithm", "matd3", "--seed", "3", "--save", tmp_path / "kept", "--quiet", "--json")
-    done = run("play-with", *SPREAD, *SHORT, *arguments)
+    done = run("play-with", *SPREAD, *SHORT, "--rounds", "12", *arguments)
     assert (done.code, done.err) == (0, "")
     found = json.loads(done.out)
     about = {"environment": SPREAD[0], "arguments": {"continuous_actions": True}, "pad": False, "algorithm": "matd3"}
     assert {key: found[key] for key in about} == about
-    assert (found["seed"], found["world_steps"], found["rounds"]) == (3, 200, 10)
+    assert (found["seed"], found["world_steps"], found["rounds"]) == (3, 200, 12)
     assert found["difference"]["mean"] == pytest.approx(found["trained"]["mean"] - found["random"]["mean"])
     kept = json.loads((tmp_path / "kept" / "policy.json").read_text())
     assert kept["returns"]["trained"] == found["trained"]["mean"]
