@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from marl_encircle import files
-from marl_encircle.experiments.metrics import summarise_cell
+from marl_encircle.experiments.metrics import summarise_cell, summarise_run
 from marl_encircle.experiments.records import read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.trainable import check_trainings
 from marl_encircle.study.protocol import Changes, Protocol, SuccessAndLength, cells_with_numbers, jobs_of, name_of
-from marl_encircle.study.typeset import markdown
+from marl_encircle.study.typeset import Text, markdown
 
 
 class CalibrationError(Exception):
@@ -35,11 +35,13 @@ class Trial(NamedTuple):
     :param changes: what differs from the centre
     :param results: means over the tuning seeds, one per setting
     :param distance: from the paper's cells
+    :param seeds: S of each tuning seed [percentage points], one row per setting
     """
 
     changes: Changes
     results: tuple[SuccessAndLength, ...]
     distance: float
+    seeds: tuple[tuple[float, ...], ...]
 
 
 class Calibration(NamedTuple):
@@ -94,50 +96,61 @@ def calibrate(
 def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
     """Return the sensitivity table, as Markdown and CSV, and the chosen scenario as YAML: file name -> text."""
     cells, chosen = protocol.cells, calibration.chosen.changes
-    rows = [(name_of(trial.changes), trial.results, f"{trial.distance:.2f}") for trial in calibration.trials]
-    rows.append(("the paper", tuple(cells_with_numbers()[cell] for cell in cells), ""))
     columns = [cell.setting.symbols for cell in cells]
     header = ["Scenario", *(f"S % / MEL at {column}" for column in columns), "Distance"]
     seeds = ", ".join(map(str, protocol.seeds))
     notes = [
         f"Chosen: {name_of(chosen)}.",
         f"A row names what differs from the centre, the scenario {protocol.scenario}.",
-        f"Each scenario was trained anew, {protocol.reward} with the tuning seeds {seeds}; numbers are their means.",
+        (
+            f"Each scenario was trained anew, {protocol.reward} with the tuning seeds {seeds}; numbers are their means,"
+            " in brackets each seed's S."
+        ),
         "Distance: |S - paper| in points + |MEL - paper| in steps, summed over the settings.",
     ]
+    paper = [cells_with_numbers()[cell] for cell in cells]
+    rows = [_row(trial) for trial in calibration.trials]
+    rows.append(["the paper", *(f"{result.success:.2f} / {result.length:.2f}" for result in paper), ""])
+    quantities = ("success_percent", "mean_episode_length", "success_percent of each seed")
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    quantities = ("success_percent", "mean_episode_length")
     writer.writerow(["scenario", *(f"{name} ({column})" for column in columns for name in quantities), "distance"])
-    for name, results, distance in rows:
-        writer.writerow([name, *(f"{value:.4f}" for result in results for value in result), distance])
+    for trial in calibration.trials:
+        values = (
+            value
+            for result, each in zip(trial.results, trial.seeds, strict=True)
+            for value in (f"{result.success:.4f}", f"{result.length:.4f}", " ".join(f"{s:.4f}" for s in each))
+        )
+        writer.writerow([name_of(trial.changes), *values, f"{trial.distance:.2f}"])
+    writer.writerow(["the paper", *(value for s, mel in paper for value in (f"{s:.4f}", f"{mel:.4f}", "")), ""])
     return {
-        "sensitivity.md": markdown(
-            "Calibration: what success depends on",
-            header,
-            [
-                [name, *(f"{r.success:.2f} / {r.length:.2f}" for r in results), distance]
-                for name, results, distance in rows
-            ],
-            notes,
-        ),
+        "sensitivity.md": markdown("Calibration: what success depends on", header, rows, notes),
         "sensitivity.csv": table.getvalue(),
         "scenario.yaml": "".join(f"{key}: {value}\n" for key, value in {"base": protocol.scenario, **chosen}.items()),
     }
 
 
+def _row(trial: Trial) -> list[Text]:
+    """Write a trial in Markdown."""
+    shown = [
+        f"{result.success:.2f} ({', '.join(f'{success:.1f}' for success in each)}) / {result.length:.2f}"
+        for result, each in zip(trial.results, trial.seeds, strict=True)
+    ]
+    return [name_of(trial.changes), *shown, f"{trial.distance:.2f}"]
+
+
 def _measure(protocol: Protocol, changes: Changes, folder: Path) -> Trial:
     """Read the trainings of one scenario."""
-    jobs, results, distance = jobs_of(protocol, changes), [], 0.0
+    jobs, results, distance, shares = jobs_of(protocol, changes), [], 0.0, []
     runs = {(run.cell.setting, run.seed): run for run in read_runs(folder, policies=False)}
     for cell in protocol.cells:
         config = next(job.config for job in jobs if job.setting == cell.setting)
-        summary = summarise_cell(
-            {seed: runs[cell.setting, seed].episodes for seed in protocol.seeds}, config.reward.closure
-        )
+        rounds = {seed: runs[cell.setting, seed].episodes for seed in protocol.seeds}
+        summary = summarise_cell(rounds, config.reward.closure)
         # Without any success a round takes its whole time
         length = summary.mean_episode_length
         result = SuccessAndLength(100 * summary.success.mean, length.mean if length else config.scenario.max_cycles)
         distance += sum(abs(ours - theirs) for ours, theirs in zip(result, cells_with_numbers()[cell], strict=True))
         results.append(result)
-    return Trial(changes, tuple(results), distance)
+        shares.append(tuple(100 * summarise_run(each, config.reward.closure).success for each in rounds.values()))
+    return Trial(changes, tuple(results), distance, tuple(shares))

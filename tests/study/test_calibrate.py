@@ -57,7 +57,8 @@ def with_distances(monkeypatch: pytest.MonkeyPatch, distances: Mapping[str, floa
 
     def measure(protocol: Protocol, changes: Mapping[str, Any], folder: Path) -> Trial:
         asked.append(name_of(changes))
-        return Trial(changes, tuple(SuccessAndLength(90.0, 20.0) for _ in protocol.cells), distances[name_of(changes)])
+        results = tuple(SuccessAndLength(90.0, 20.0) for _ in protocol.cells)
+        return Trial(changes, results, distances[name_of(changes)], tuple((90.0,) for _ in results))
 
     monkeypatch.setattr(calibration, "sweep", lambda jobs, *_: Progress(total=len(jobs), done=len(jobs)))
     monkeypatch.setattr(calibration, "_measure", measure)
@@ -143,8 +144,12 @@ def test_the_distance_is_to_the_papers_cells(
     (ours,) = result.chosen.results
     assert result.chosen.distance == pytest.approx(abs(ours.success - 97.88) + abs(ours.length - 23.51))
     table = (tmp_path / "sensitivity.csv").read_text().splitlines()
-    assert table[1] == f"centre,{ours.success:.4f},{ours.length:.4f},{result.chosen.distance:.2f}"
-    assert table[2] == "the paper,97.8800,23.5100,"
+    ((each,),) = result.chosen.seeds
+    assert each == pytest.approx(ours.success), "one seed"
+    assert table[1] == f"centre,{ours.success:.4f},{ours.length:.4f},{each:.4f},{result.chosen.distance:.2f}"
+    assert table[2] == "the paper,97.8800,23.5100,,"
+    text = (tmp_path / "sensitivity.md").read_text()
+    assert f"| centre | {ours.success:.2f} ({each:.1f}) / {ours.length:.2f} |" in text
     before = everything_in(tmp_path)
     assert calibrate(one, tmp_path, 1) == result
     assert everything_in(tmp_path) == before

@@ -46,7 +46,7 @@ def test_a_card_has_the_figures_of_its_run() -> None:
         # Wilson with z = 1.96 for 150 of 200: (0.75 + 0.0096 -+ 0.0606) / 1.0192
         "| success S | 75.0 %; Wilson's 95 % interval: 68.6 to 80.5 % |",
         "| mean episode length MEL | 20.00 steps, of the rounds won |",
-        "| evaluation | 200 rounds of evaluation seed 1000, without noise |",
+        "| evaluation | 200 rounds of evaluation seed 4000, without noise |",
         "| training seed | 0 |",
         "| training | 400 world steps in 4 worlds |",
         f"| configuration | sha256 `{record['config_hash']}` |",
