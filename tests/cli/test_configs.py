@@ -69,7 +69,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
 SETTINGS = "settings: [{speed_ratio: 1.1, pursuers: 3, obstacles: 1}]"
 GRID = "profile: smoke\nshared: []\ngroups: "
 SEARCH = "profile: smoke\nsetting: {speed_ratio: 1.1, pursuers: 3, obstacles: 1}\nseeds: [950]\nlast_points: 1\n"
-PROTOCOL = "reward: ours\nprofile: smoke\nscenario: centre\nseeds: [1]\ncombinations: 0\n"
+PROTOCOL = "reward: ours\nprofile: smoke\nscenario: centre\nseeds: [1]\nevaluation_seed: 1000\ncombinations: 0\n"
 KINDS = {
     "reward": ("base: ours\nterms: {contraction: 2.0}", "base: ours\nterm: {}", "term: unknown key"),
     "scenario": ("acceleration: 3", "base: paper\nacceleration: -3", "acceleration must be"),
