@@ -17,9 +17,10 @@ LABELS = {
     "generalist": "Ours+, one policy",
 }
 TABLE_METHODS = ("ma2019", "model_a", "model_b", "ours")
-"""Methods of Tables 2-4 in the paper's order; others follow by name."""
+"""Methods of Tables 2-4 in the paper's order."""
 PAPER_METHODS = (*TABLE_METHODS, "model_c")
 """All that the paper compares."""
+_ORDER = tuple(dict.fromkeys((*PAPER_METHODS, *LABELS)))
 
 
 class PaperResult(NamedTuple):
@@ -52,5 +53,5 @@ def label(method: str) -> str:
 
 
 def rank(method: str) -> tuple[int, str]:
-    """Sort key of methods: those of Tables 2-4 in the paper's order, then the others by name."""
-    return (TABLE_METHODS.index(method) if method in TABLE_METHODS else len(TABLE_METHODS), method)
+    """Sort key of methods: those of Tables 2-4 in the paper's order, Model C, what goes beyond, then others by name."""
+    return (_ORDER.index(method) if method in _ORDER else len(_ORDER), method)

@@ -269,8 +269,8 @@ def test_a_method_that_the_paper_lacks_gets_its_row_after_the_papers() -> None:
     rendered = tables.render_tables(runs, asked=[Cell("idea", ONE), Cell("idea", Setting(1.1, 3, 7))])
     rows = markdown_rows(rendered["table4.md"])[8:]
     assert rows == [
-        ["idea", "", "not run", "", ""],
         ["Model C", "70.0 / 20.0", "80.0 / 20.0", "", ""],
+        ["idea", "", "not run", "", ""],
         ["my_method", "", "90.0 / 20.0", "", ""],
     ]
     assert "- Empty: the grid does not ask for it.\n" in rendered["table4.md"]
