@@ -160,4 +160,5 @@ def _rules(scenario: Scenario) -> list[str]:
 
 
 def _literal(value: object) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    """Write a name, a number or a tuple of them, with the quotes that the rest of the code has."""
+    return repr(value).replace("'", '"')
