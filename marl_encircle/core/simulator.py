@@ -107,7 +107,7 @@ class Simulator:
 
         :param seed: one seed for all (world b gets ``world_seeds(seed, B)[b]``), or one for each world
         """
-        seeds = list(seed) if isinstance(seed, Sequence) else world_seeds(seed, self.n_worlds)
+        seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else world_seeds(seed, self.n_worlds)
         if len(seeds) != self.n_worlds:
             raise ValueError(f"{self.n_worlds} worlds need {self.n_worlds} seeds; got {len(seeds)}")
         self._streams = [np.random.default_rng(s) for s in seeds]

@@ -88,6 +88,16 @@ def test_a_placement_draws_the_same_number_of_random_numbers_for_ever() -> None:
     assert sim.get_state()["streams"] == [stream.bit_generator.state]
 
 
+def test_the_seeds_of_worlds_may_be_an_array() -> None:
+    seeds = world_seeds(4, 3)
+    listed, array = Simulator(DENSE, 3, seed=0), Simulator(DENSE, 3, seed=0)
+    listed.seed(seeds)
+    array.seed(np.array(seeds))  # type: ignore[arg-type]  # typed as a sequence
+    for sim in (listed, array):
+        sim.reset()
+    assert np.array_equal(listed.state.pursuers, array.state.pursuers)
+
+
 def test_worlds_without_a_seed_differ_every_time() -> None:
     a, b = Simulator(Scenario(), 2), Simulator(Scenario(), 2)
     assert (a.reset().target_distance != b.reset().target_distance).all()
