@@ -14,6 +14,7 @@ from marl_encircle.study.cells import gather
 from marl_encircle.study.reproduce import write_tables
 
 HARD = Setting(1.4, 3, 1)
+RESULTS = Path(__file__).parents[2] / "results"
 
 
 def test_what_was_before_stands_beside_what_is_since() -> None:
@@ -39,6 +40,15 @@ def test_what_has_not_been_trained_again_is_said() -> None:
     text = render_amendment([finished("model_b", HARD, 0, 9), finished("ours", HARD, 0, 40)], {})["table_amendment.md"]
     assert [row[0] for row in markdown_rows(text)] == ["Model B", "Ours"]
     assert markdown_row(text, "Ours", "1.4", "3", "1")[1:] == ["not run", ""]
+
+
+def test_a_committed_training_that_is_longer_goes_through_the_shorter_one() -> None:
+    longer = sorted((RESULTS / "amended").glob("*/*/*/progress.csv"))
+    assert longer
+    for path in longer:
+        shorter = (RESULTS / "runs" / path.relative_to(RESULTS / "amended")).read_text()
+        assert path.read_text().startswith(shorter), path
+        assert len(path.read_text()) > len(shorter), path
 
 
 def test_former_rounds_need_no_policy_and_their_table_goes_with_them(tmp_path: Path) -> None:
