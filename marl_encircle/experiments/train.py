@@ -215,6 +215,8 @@ class _Run:
         for name, data in contents.items():
             files.write_bytes(self.folder / name, data)
         contents[CURVE] = (self.folder / CURVE).read_bytes()
+        for name in contents:
+            files.remove(files.compressed(self.folder / name))  # of a former run here
         record = {
             "schema": SCHEMA,
             "status": status,

@@ -290,10 +290,16 @@ class _Search:
         return False
 
     def _worth(self, attempt: _Attempt, job: Job) -> float:
-        """Return what a training that has ended is worth: nothing if it has diverged."""
+        """Return what a training that has ended is worth: nothing if it has diverged.
+
+        :raises DamagedFileError: if the learning curve of one that has finished is lost
+        """
         if attempt.status(job) == "diverged":
             return 0.0
-        return mean(attempt.curve(job, self.space.points)[-self.space.file.last_points :])
+        curve = attempt.curve(job, self.space.points)
+        if not curve:
+            raise files.DamagedFileError(attempt.run(job) / CURVE, "no learning curve: the training has finished")
+        return mean(curve[-self.space.file.last_points :])
 
     def _end(self, attempt: _Attempt, state: "optuna.trial.TrialState", worth: float | None = None) -> None:
         """Say what became of a trial; what it still trains is of no use."""

@@ -16,6 +16,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch as th
+from made_up import compress
 from stable_baselines3.common import logger
 from tiny_runs import (
     FILES,
@@ -105,6 +106,15 @@ def test_a_finished_run_is_not_trained_again(monkeypatch: pytest.MonkeyPatch, tm
     folder = copy_of_finished(tmp_path)
     monkeypatch.setattr(train, "_Run", lambda *_: pytest.fail("it was trained again"))
     assert train.train(tiny(), 0, "native", tmp_path) == (folder, False)
+
+
+def test_a_run_that_takes_the_place_of_a_former_one_leaves_nothing_of_it(tmp_path: Path) -> None:
+    folder = copy_of_finished(tmp_path)
+    for name in FILES:
+        compress(folder / name)
+    (folder / "run.json").unlink()
+    train.train(tiny(), 0, "native", tmp_path)
+    assert everything_in(folder) == everything_in(finished())
 
 
 @pytest.mark.parametrize(

@@ -313,20 +313,26 @@ def test_a_training_whose_process_is_killed_is_tried_again(
     assert [job.seed for job in started] == [950, 951, 950]
 
 
-@pytest.mark.parametrize("point", ["2,nan", "2,1.5", "1,0.5"], ids=["no number", "no share", "no later step"])
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        ("1,0.5\n2,nan\n", "success must"),
+        ("1,0.5\n2,1.5\n", "success must"),
+        ("1,0.5\n1,0.5\n", "world_steps must"),
+        ("", "the training has finished"),
+    ],
+    ids=["no number", "no share", "no later step", "no points"],
+)
 def test_a_search_refuses_a_damaged_learning_curve(
-    space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, point: str
+    space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: str, reason: str
 ) -> None:
     class Damaged(Trained):
         def __init__(self, job: Job, out: Path) -> None:
             super().__init__(job, out)
-            path = run_folder(job.config, job.seed, out) / "progress.csv"
-            files.write_text(path, f"world_steps,success\n1,0.5\n{point}\n")
+            files.write_text(run_folder(job.config, job.seed, out) / "progress.csv", f"world_steps,success\n{points}")
 
     monkeypatch.setattr(executors, "_start", Damaged)
-    with pytest.raises(
-        files.DamagedFileError, match=r"seed950/progress\.csv: no learning curve: (success|world_steps) must"
-    ):
+    with pytest.raises(files.DamagedFileError, match=rf"seed950/progress\.csv: no learning curve: {reason}"):
         tune(space, tmp_path / "out", 1, 1)
 
 
