@@ -76,8 +76,9 @@ def draw_arcs(axes: Axes, moment: Snapshot, linewidth: float) -> None:
 def draw_ring(axes: Axes, moment: Snapshot, inner: float, outer: float) -> None:
     """Draw a ring around the target whose segments, the contributing angles, have the colours of their owners."""
     for owner, directions in stretches(moment.owner):
+        if owner == NOBODY:
+            continue
         angles = np.degrees(borders(directions, len(moment.owner)))
-        colour = PAPER if owner == NOBODY else entity_colour(owner, len(moment.pursuers))
         axes.add_patch(
             Sector(
                 (moment.target[0], moment.target[1]),
@@ -85,7 +86,7 @@ def draw_ring(axes: Axes, moment: Snapshot, inner: float, outer: float) -> None:
                 angles[0],
                 angles[-1],
                 width=outer - inner,
-                facecolor=rgb(colour),
+                facecolor=rgb(entity_colour(owner, len(moment.pursuers))),
                 edgecolor=rgb(PAPER),
                 linewidth=0.5,
                 zorder=5,

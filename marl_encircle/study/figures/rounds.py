@@ -115,7 +115,7 @@ def draw_figure6(columns: Sequence[Column]) -> Figure:
         if number > 0:
             above.set_yticklabels([])
     grid[0][0].set_ylabel("y [scene units]", labelpad=1)
-    grid[1][0].set_ylabel(f"{2 * ZOOM:.2g} scene units")
+    grid[1][0].set_ylabel(f"at success, {2 * ZOOM:.2g} units wide")
     grid[0][len(columns) // 2].set_xlabel("x [scene units]", labelpad=1)
     put_below(figure, _legend())
     return figure
@@ -181,9 +181,11 @@ def _draw_body(axes: Axes, place: Array, radius: float, number: int, opacity: fl
 def _legend() -> list[Artist]:
     ink = rgb(INK)
     return [
-        Line2D([], [], color=rgb(pursuer_colour(0)), marker=".", markersize=3, label="pursuer, a dot each step"),
+        Line2D([], [], color=rgb(pursuer_colour(0)), marker=".", markersize=3, label="pursuer"),
         Line2D([], [], color=ink, marker=".", markersize=3, label="target"),
         Line2D([], [], linestyle="none", marker="o", markersize=4, markerfacecolor="none", color=ink, label="start"),
         Patch(facecolor=rgb(OBSTACLE), edgecolor=rgb(OBSTACLE_EDGE), label="obstacle"),
-        Patch(facecolor="none", edgecolor=ink, label=r"movement range $R_m$"),
+        Line2D([], [], color=rgb(pursuer_colour(1)), linewidth=0.9, label="Apollonius circle"),
+        Line2D([], [], color=rgb(pursuer_colour(1)), linewidth=3.5, label="contributing angle"),
+        Patch(facecolor="none", edgecolor=ink, label=r"range $R_m$"),
     ]
