@@ -107,6 +107,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
             " in brackets each seed's S."
         ),
         "Distance: |S - paper| in points + |MEL - paper| in steps, summed over the settings.",
+        "MEL without any success: the length of a whole round.",
     ]
     paper = [cells_with_numbers()[cell] for cell in cells]
     rows = [_row(trial) for trial in calibration.trials]
