@@ -44,6 +44,7 @@ MODULES = (
 )
 TESTS = {
     "maddpg/agents.py": ("maddpg/test_maddpg.py",),
+    "maddpg/arguments.py": ("maddpg/test_maddpg.py",),
     "maddpg/maddpg.py": ("maddpg/test_maddpg.py", "maddpg/test_saving.py"),
     "maddpg/matd3.py": ("maddpg/test_maddpg.py",),
     "maddpg/models.py": ("maddpg/test_networks.py", "maddpg/test_gradients.py", "maddpg/test_maddpg.py"),

@@ -26,6 +26,8 @@ class JointReplayBuffer(ReplayBuffer):
     :param n_steps: steps whose rewards are summed, fewer where the episode or the newest step comes first
     :param gamma: discount factor of that sum
     :param kwargs: passed on to SB3's ``ReplayBuffer``
+    :raises ValueError: for slots that are no whole worlds, a sum of no rewards, or one that
+        ``optimize_memory_usage`` has no observations for
     """
 
     def __init__(
@@ -91,6 +93,16 @@ class JointReplayBuffer(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.full = True
             self.pos = 0
+
+    def end_episodes(self) -> None:
+        """Let returns of several steps end at the newest step: the environment is about to be reset.
+
+        An episode that was under way there counts as truncated, so that its last observation is still bootstrapped.
+        """
+        if self.n_steps > 1 and self.size():
+            newest = (self.pos - 1) % self.buffer_size
+            under_way = self.dones[newest] == 0
+            self.dones[newest, under_way] = self.timeouts[newest, under_way] = 1
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Joint transitions of randomly drawn worlds, over ``n_steps`` steps.

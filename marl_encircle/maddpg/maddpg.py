@@ -11,7 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from marl_encircle.maddpg.agents import count_agents, names_of_agents
+from marl_encircle.maddpg.arguments import check_range, number_or_schedule
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
 from marl_encircle.maddpg.models import Actor, CentralCritic, CriticKind
@@ -73,6 +74,7 @@ class MADDPG(OffPolicyAlgorithm):
     :param policy_kwargs: passed on to the policy, see ``MADDPGPolicy``
     :param seed: seed of the pseudo random generators
     :param kwargs: passed on to SB3's ``OffPolicyAlgorithm``
+    :raises ValueError: for what MADDPG cannot do with this policy, environment or number, with what is allowed
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
@@ -141,10 +143,12 @@ class MADDPG(OffPolicyAlgorithm):
         self.critic_kind = critic
         if exploration_noise is None:
             exploration_noise = 0.3 if action_noise is None else 0.0
-        self.exploration_noise = exploration_noise
-        self.exploration_random = exploration_random
-        if policy_delay < 1:
-            raise ValueError(f"policy_delay must be at least 1, but got {policy_delay}")
+        self.exploration_noise = number_or_schedule("exploration_noise", exploration_noise)
+        self.exploration_random = number_or_schedule("exploration_random", exploration_random, 1)
+        check_range("batch_size", batch_size, 1)
+        check_range("gamma", gamma, 0, 1)
+        check_range("tau", tau, 0, 1)
+        check_range("policy_delay", policy_delay, 1)
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise ValueError(f"max_grad_norm must be positive or None, but got {max_grad_norm}")
         self.policy_delay = policy_delay
@@ -158,10 +162,13 @@ class MADDPG(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self._convert_train_freq()
+        check_range("train_freq", self.train_freq.frequency, 1)  # type: ignore[union-attr]  # converted
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
         self.n_agents = count_agents(self.env, self.n_agents)
         self.agents = names_of_agents(self.env, self.n_agents) or self.agents
+        if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
+            self.action_noise = self.action_noise.base_noise  # SB3 makes one of it for as many slots as there are
         # The exploration's own generator goes on where a loaded model stopped
         super().set_random_seed(self.seed)
 
@@ -187,10 +194,10 @@ class MADDPG(OffPolicyAlgorithm):
             self.lr_schedule,
             n_agents=self.n_agents,
             critic=self.critic_kind,
+            agents=self.agents,
             **{"n_critics": self.n_critics, **self.policy_kwargs},
         )
         self.policy = self.policy.to(self.device)
-        self.policy.agents = self.agents
         self._create_aliases()
 
     def _create_aliases(self) -> None:
@@ -292,6 +299,19 @@ class MADDPG(OffPolicyAlgorithm):
         :param progress_bar: whether to show one
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:  # then SB3 resets the environment
+            assert self.replay_buffer is not None
+            self.replay_buffer.end_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def collect_rollouts(
         self,
@@ -459,6 +479,24 @@ class MADDPG(OffPolicyAlgorithm):
         """
         with whole_file(path, ".pkl") as target:
             super().save_replay_buffer(target)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Load a replay buffer from a pickle file as SB3 does.
+
+        **Such a file can run code when it is loaded: load only files that you trust.**
+
+        :param path: the file
+        :param truncate_last_traj: unused, SB3's interface
+        :raises ValueError: if it was made for other slots, agents or returns; the former buffer stays
+        """
+        former = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded, self.replay_buffer = self.replay_buffer, former
+        for name, wanted in {"n_envs": self.n_envs, "n_agents": self.n_agents, "n_steps": self.n_steps}.items():
+            if getattr(loaded, name, None) != wanted:
+                saved = getattr(loaded, name, "none")
+                raise ValueError(f"{path} is no replay buffer of this model: its {name} is {saved}, not {wanted}")
+        self.replay_buffer = loaded
 
     @classmethod
     def load(

@@ -40,14 +40,15 @@ class MADDPGPolicy(BasePolicy):
     :param optimizer_class: one optimizer for all actors, one for all critics
     :param optimizer_kwargs: its keyword arguments, except the learning rate; Adam is fused unless told otherwise
     :param share_parameters: one actor for all agents; the critics stay as ``critic`` says
+    :param agents: the agents' names in the order of the slots, where they are known: whose observation is whose in a
+        dict
+    :raises ValueError: for a ``critic`` that there is not
     """
 
     actor: Actor
     actor_target: Actor
     critic: CentralCritic
     critic_target: CentralCritic
-    agents: tuple[str, ...] | None = None
-    """The agents' names in the order of the slots, where they are known: whose observation is whose in a dict."""
 
     def __init__(
         self,
@@ -65,6 +66,7 @@ class MADDPGPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         share_parameters: bool = False,
+        agents: tuple[str, ...] | None = None,
     ) -> None:
         if optimizer_kwargs is None:
             optimizer_kwargs = {"fused": True} if optimizer_class is th.optim.Adam else {}
@@ -87,6 +89,7 @@ class MADDPGPolicy(BasePolicy):
         self.net_arch = [64, 64] if net_arch is None else net_arch
         self.activation_fn = activation_fn
         self.share_parameters = share_parameters
+        self.agents = agents
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -166,6 +169,7 @@ class MADDPGPolicy(BasePolicy):
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
             "share_parameters": self.share_parameters,
+            "agents": self.agents,
         }
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

@@ -35,13 +35,13 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
         lambda _: 0.0,
         n_agents=data["n_agents"],
         critic=data["critic_kind"],
+        agents=data.get("agents"),
         **data["policy_kwargs"],
     )
     saved = cast(dict[str, th.Tensor], parameters["policy"])
     prefix = "actor."
     policy.actor.load_state_dict({name.removeprefix(prefix): saved[name] for name in saved if name.startswith(prefix)})
     policy.set_training_mode(False)
-    policy.agents = data.get("agents")
     return policy
 
 

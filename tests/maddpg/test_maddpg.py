@@ -487,6 +487,15 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
         ({"policy_delay": 0}, "policy_delay must be at least 1, but got 0"),
         ({"max_grad_norm": 0.0}, r"max_grad_norm must be positive or None, but got 0\.0"),
         ({"max_grad_norm": -1.0}, r"max_grad_norm must be positive or None, but got -1\.0"),
+        ({"train_freq": 0}, "train_freq must be at least 1, but got 0"),
+        ({"train_freq": (-1, "episode")}, "train_freq must be at least 1, but got -1"),
+        ({"batch_size": 0}, "batch_size must be at least 1, but got 0"),
+        ({"gamma": 1.5}, r"gamma must be between 0 and 1, but got 1\.5"),
+        ({"tau": -0.1}, r"tau must be between 0 and 1, but got -0\.1"),
+        ({"exploration_noise": -1.0}, r"exploration_noise must be at least 0, but got -1\.0"),
+        ({"exploration_noise": float("nan")}, "exploration_noise must be at least 0, but got nan"),
+        ({"exploration_noise": "0.3"}, "exploration_noise must be a number or a function .* but got '0.3'"),
+        ({"exploration_random": 5}, "exploration_random must be between 0 and 1, but got 5"),
     ],
     ids=str,
 )
@@ -535,8 +544,10 @@ def test_a_dict_is_read_by_name_where_the_environment_names_its_agents(tmp_path:
             assert all((actions[name] == expected[name]).all() for name in Named.agents)
             with pytest.raises(ValueError, match="observations of left, middle, right"):
                 same.predict({f"agent_{i}": np.zeros(3) for i in range(3)})
-        actions, _ = load_actors(tmp_path / "model.zip").predict({name: obs[name] for name in reversed(Named.agents)})
-        assert all((actions[name] == expected[name]).all() for name in Named.agents)
+        model.policy.save(tmp_path / "policy.pth")
+        for actors in load_actors(tmp_path / "model.zip"), MADDPGPolicy.load(tmp_path / "policy.pth", device="cpu"):
+            actions, _ = actors.predict({name: obs[name] for name in reversed(Named.agents)})
+            assert all((actions[name] == expected[name]).all() for name in Named.agents)
 
 
 def test_the_names_are_those_of_the_environment_that_is_set_last() -> None:
@@ -608,6 +619,12 @@ def test_exploration_noise_has_its_standard_deviation_and_follows_its_schedule()
     assert (explored(model) - greedy).std() == pytest.approx(0.1, rel=0.05)
     model._current_progress_remaining = 0.0
     np.testing.assert_allclose(explored(model, 1)[0], greedy, atol=1e-6)
+
+
+def test_exploration_may_be_told_in_numpys_numbers() -> None:
+    model = make_model(exploration_noise=np.float32(0.25), exploration_random=np.int64(0))
+    model.learn(120)
+    assert (model.exploration_noise, model.exploration_random) == (0.25, 0)
 
 
 def test_exploration_random_replaces_a_share_of_the_actions() -> None:
@@ -688,6 +705,65 @@ def test_a_saved_model_acts_alike_and_learns_on_with_any_number_of_worlds(
     without_env = load(cls, tmp_path / "model.zip")
     obs = np.ones((6, 3), np.float32)
     np.testing.assert_array_equal(without_env.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_action_noise_is_that_of_as_many_slots_as_there_are_after_loading(tmp_path: Path) -> None:
+    model = make_model(action_noise=NormalActionNoise(np.zeros(2), np.full(2, 1e-3)))
+    model.learn(60)
+    model.save(tmp_path / "model.zip")
+    for n_worlds in 7, 1:
+        loaded = load(MADDPG, tmp_path / "model.zip", env=LabelledWorlds(n_worlds=n_worlds))
+        loaded.learn(3 * n_worlds)
+        assert isinstance(loaded.action_noise, VectorizedActionNoise)
+        assert len(loaded.action_noise.noises) == 3 * n_worlds
+
+
+@pytest.mark.parametrize("again", ["learn", "load"])
+def test_returns_of_several_steps_do_not_run_on_into_an_episode_after_a_reset(again: str, tmp_path: Path) -> None:
+    model = make_model(n_steps=3, learning_starts=10**6)
+    model.learn(12 * 8)  # episodes have five steps: the second one is left in the middle, at its third
+    if again == "learn":
+        model.learn(12 * 4)
+    else:
+        model.save(tmp_path / "model.zip")
+        model.save_replay_buffer(tmp_path / "buffer.pkl")
+        model = load(MADDPG, tmp_path / "model.zip", env=LabelledWorlds())
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+        model.learn(12 * 4, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert buffer.pos == 12
+    batch = buffer._get_samples(np.repeat(np.arange(12), 20))
+    steps = (batch.next_observations - batch.observations)[:, 0, 2].reshape(12, 20).amax(dim=1)
+    assert steps[:8].tolist() == [3, 3, 3, 2, 1, 3, 2, 1]
+    assert not batch.dones.any(), "time limits and the cut are bootstrapped"
+
+
+def test_going_on_without_a_reset_cuts_nothing() -> None:
+    model = make_model(n_steps=3, learning_starts=10**6)
+    model.learn(12 * 8)
+    model.learn(12 * 4, reset_num_timesteps=False)
+    batch = model.replay_buffer._get_samples(np.full(20, 7))
+    assert (batch.next_observations - batch.observations)[0, 0, 2] == 3
+
+
+@pytest.mark.parametrize(
+    ("other", "difference"),
+    [
+        ({"n_steps": 1}, "n_steps is 1, not 3"),
+        ({"env": LabelledWorlds(n_worlds=2)}, "n_envs is 6, not 12"),
+        ({"env": LabelledWorlds(n_worlds=6, n_agents=2)}, "n_agents is 2, not 3"),
+    ],
+    ids=["n_steps", "worlds", "agents"],
+)
+def test_a_replay_buffer_of_another_model_is_refused_and_the_own_one_stays(
+    tmp_path: Path, other: dict[str, Any], difference: str
+) -> None:
+    make_model(**{"n_steps": 3, **other}).save_replay_buffer(tmp_path / "buffer.pkl")
+    model = make_model(n_steps=3)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match=rf"buffer\.pkl is no replay buffer of this model: its {difference}"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer is own
 
 
 def test_a_policy_is_saved_and_loaded_without_its_model_as_in_sb3(tmp_path: Path) -> None:
