@@ -6,7 +6,7 @@ A term gets its weight, its parameters and its name in the logs from the reward'
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple, get_args
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle.core.geometry import Closure, Enclosure, Measure
-from marl_encircle.core.scenario import Scenario
+from marl_encircle.core.scenario import Scenario, plain
 from marl_encircle.core.simulator import State
 from marl_encircle.spelling import nearest
 
@@ -30,7 +30,7 @@ class Transition(NamedTuple):
     state: State
     """After the step."""
     actions: Array
-    """What the pursuers did, (B, N, 2)."""
+    """What the pursuers did, in [-1, 1], (B, N, 2)."""
     measure: Measure
     """After the step."""
     former_measure: Measure
@@ -161,7 +161,8 @@ class Reward:
     :param closure: which enclosure counts, in the terms and for success: with obstacles (``all``) or ``pursuers`` alone
     :param two_stage: whether contraction and completion wait for the stage threshold (the lion method)
     :param scale: factor of the whole reward
-    :raises ValueError: for an unknown term or parameter, naming the nearest known one
+    :raises ValueError: for an unknown term or parameter, naming the nearest known one; for a term without weight, a
+        number that is not finite or an unknown closure rule
     """
 
     terms: Mapping[str, float | Mapping[str, float] | None] = field(default_factory=lambda: dict(OURS))
@@ -170,28 +171,17 @@ class Reward:
     scale: float = 0.05
 
     def __post_init__(self) -> None:
+        for f in fields(self):
+            object.__setattr__(self, f.name, plain(getattr(self, f.name)))
         if self.closure not in get_args(Closure):
             raise ValueError(f"closure must be one of {', '.join(get_args(Closure))}; got {self.closure!r:.80}")
         if not isinstance(self.terms, Mapping):
             raise ValueError(f"terms must be a mapping of terms to their weights; got {self.terms!r:.80}")
+        terms: dict[str, Any] = {}
         for name, term in self.terms.items():
-            if name not in TERMS:
-                raise ValueError(f"terms.{name:.80}: unknown reward term{nearest(name, TERMS)}")
-            settings = dict(term) if isinstance(term, Mapping) else {"weight": term}
-            known = ("weight", *list(inspect.signature(TERMS[name]).parameters)[1:])
-            for key, value in settings.items():
-                if key not in known:
-                    raise ValueError(f"terms.{name}.{key:.80}: unknown parameter{nearest(key, known)}")
-                if key == "weight" and value is None:
-                    continue
-                if (
-                    isinstance(value, bool)
-                    or not isinstance(value, (int, float))
-                    or not abs(value) <= sys.float_info.max
-                ):
-                    raise ValueError(f"terms.{name}.{key} must be a finite number; got {value!r:.80}")
-            if "weight" not in settings:
-                raise ValueError(f"terms.{name} needs a weight")
+            terms[name] = {k: plain(v) for k, v in term.items()} if isinstance(term, Mapping) else plain(term)
+            _check(name, terms[name])
+        object.__setattr__(self, "terms", terms)
 
     @cached_property
     def active(self) -> dict[str, tuple[float, dict[str, float]]]:
@@ -221,3 +211,20 @@ class Reward:
             share = (self.scale * weight) * value
             shares[name] = share * gate if gate is not None and name in CONTRACTION_STAGE else share
         return shares
+
+
+def _check(name: str, term: Any) -> None:
+    """Raise a ValueError unless this is a term's weight, or its weight and parameters."""
+    if name not in TERMS:
+        raise ValueError(f"terms.{name:.80}: unknown reward term{nearest(name, TERMS)}")
+    settings = term if isinstance(term, Mapping) else {"weight": term}
+    known = ("weight", *list(inspect.signature(TERMS[name]).parameters)[1:])
+    for key, value in settings.items():
+        if key not in known:
+            raise ValueError(f"terms.{name}.{key:.80}: unknown parameter{nearest(key, known)}")
+        if key == "weight" and value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
+            raise ValueError(f"terms.{name}.{key} must be a finite number; got {value!r:.80}")
+    if "weight" not in settings:
+        raise ValueError(f"terms.{name} needs a weight")

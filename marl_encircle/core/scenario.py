@@ -116,12 +116,10 @@ class Scenario:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
         for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, np.number):
-                value = value.item()
+            value = plain(getattr(self, f.name))
             _check(f.name, value, hints[f.name], f.metadata)
-            if hints[f.name] in (int, float):  # 1, 1.0 and NumPy's are one scenario, and one compilation
-                object.__setattr__(self, f.name, hints[f.name](value))
+            # 1, 1.0 and NumPy's are one scenario, and one compilation
+            object.__setattr__(self, f.name, hints[f.name](value) if hints[f.name] in (int, float) else value)
         if self.n_directions % 2:
             raise ValueError(f"n_directions must be even (each direction has its opposite); got {self.n_directions}")
         for name, known in (("scene", SCENES), ("target", TARGETS)):
@@ -179,6 +177,11 @@ class Scenario:
     def solvable_without_obstacles(self) -> bool:
         """Whether the pursuers alone can close the circle: n >= pi / arcsin(1 / lambda), Eq. 6."""
         return self.pursuers >= math.pi / math.asin(1 / self.speed_ratio)
+
+
+def plain(value: Any) -> Any:
+    """Return a NumPy scalar as Python's own number, truth value or text; anything else as it is."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check(name: str, value: object, hint: Any, metadata: Any) -> None:

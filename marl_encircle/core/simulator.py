@@ -70,6 +70,7 @@ class Simulator:
     :param scenario: the rules; worlds may differ in difficulty only
     :param n_worlds: B
     :param seed: see :meth:`seed`; without one, worlds start from fresh entropy
+    :raises ValueError: for fewer than one world, or seeds that :meth:`seed` would not take
     """
 
     def __init__(self, scenario: Scenario, n_worlds: int = 1, seed: int | None = None) -> None:
@@ -106,6 +107,7 @@ class Simulator:
         """Give every world a new random stream, which its next resets draw from.
 
         :param seed: one seed for all (world b gets ``world_seeds(seed, B)[b]``), or one for each world
+        :raises ValueError: for a negative seed, or another number of seeds than of worlds
         """
         seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else world_seeds(seed, self.n_worlds)
         if len(seeds) != self.n_worlds:

@@ -49,6 +49,7 @@ class Arena:
     :param scenario: the rules
     :param reward: the reward, and the closure rule that ends a round
     :param n_worlds: B
+    :raises ValueError: for fewer than one world
     """
 
     def __init__(self, scenario: Scenario, reward: Reward, n_worlds: int) -> None:
@@ -68,6 +69,7 @@ class Arena:
         """Start a new round in every world.
 
         :return: what all pursuers see first, (B, N, O)
+        :raises PlacementError: if the bodies cannot be placed
         """
         self.simulator.reset()
         self.rounds.start(self._everywhere)
@@ -78,6 +80,7 @@ class Arena:
 
         :param worlds: their indices, (W,)
         :param observations: of all worlds; those of ``worlds`` are overwritten, (B, N, O)
+        :raises PlacementError: if the bodies cannot be placed
         """
         self.simulator.reset(worlds)
         self.rounds.start(worlds)
@@ -86,13 +89,15 @@ class Arena:
     def step(self, actions: ArrayLike) -> Outcome:
         """Move all worlds by one step.
 
-        :param actions: in [-1, 1], (B, N, 2)
-        :raises ValueError: for an action that is not finite, naming world and pursuer; nothing moves then
+        :param actions: in [-1, 1], clipped beyond, (B, N, 2)
+        :raises ValueError: for actions of a wrong shape, or not finite, naming world and pursuer; nothing moves then
+        :raises ValueError: if a reward term returns something else than (B, N)
         """
         actions = np.asarray(actions, np.float64)
         sim, closure = self.simulator, self.reward.closure
-        measure = sim.step(actions)
-        shares = self.reward.parts(Transition(self.scenario, sim.state, actions, measure, sim.former_measure, closure))
+        measure = sim.step(actions)  # clips as well, once it has refused what is not finite
+        clipped = actions.clip(-1.0, 1.0)
+        shares = self.reward.parts(Transition(self.scenario, sim.state, clipped, measure, sim.former_measure, closure))
         rewards = self.rounds.add(sim.steps, measure, shares)
         terminated = measure.enclosure[closure].complete.copy()
         truncated = (sim.steps >= self.scenario.max_cycles) & ~terminated

@@ -80,6 +80,7 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
     :param scenario: the rules
     :param reward: the reward, and the closure rule that ends a round
     :param render_mode: None, ``human`` or ``rgb_array``
+    :raises ValueError: for an unknown render mode
     :raises ImportError: if something is to be drawn and pygame-ce is missing
     """
 
@@ -96,7 +97,6 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             raise ValueError(f"render_mode must be None or one of {', '.join(modes)}; got {render_mode!r:.80}")
         if render_mode is not None:
             _load_renderer()  # so that a missing pygame-ce is told here, not at the first picture
-        self.scenario, self.reward = scenario, reward
         self.render_mode = render_mode
         self._trail: list[NDArray[np.float64]] = []
         self._window: Any = None
@@ -106,6 +106,16 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         # Space objects of each agent's own, so that seeding one agent's samples leaves the others' alone.
         self._spaces = {agent: spaces_of(scenario) for agent in self.possible_agents}
         self.state_space = _state_space(scenario)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The rules. They stay: other rules need another environment."""
+        return self._arena.scenario
+
+    @property
+    def reward(self) -> Reward:
+        """The reward, and the closure rule that ends a round. It stays: another reward needs another environment."""
+        return self._arena.reward
 
     @property
     def simulator(self) -> Simulator:
@@ -123,7 +133,10 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         return space
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
-        """Change speed ratio, safety distance or obstacle radius from the next round on."""
+        """Change speed ratio, safety distance or obstacle radius from the next round on.
+
+        :raises ValueError: for another field, or a value that the scenario would not take
+        """
         self._arena.simulator.set_difficulty(difficulty)
 
     def reset(
@@ -134,6 +147,8 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
         :param seed: starts a new stream of random numbers, as in any other engine's world with this seed; None goes on
         :param options: not used
         :return: observations and infos by agent
+        :raises ValueError: for a negative seed
+        :raises PlacementError: if the bodies cannot be placed
         """
         if seed is not None:
             self._arena.simulator.seed([seed])

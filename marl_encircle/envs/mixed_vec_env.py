@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from marl_encircle.core.observations import layout
+from marl_encircle.core.observations import bounds, layout
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Difficulty, world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE, spaces_of
+from marl_encircle.envs.arena import ACTION_SIZE
 from marl_encircle.envs.slot_vec_env import SlotVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 
@@ -47,22 +47,20 @@ class MixedVecEnv(SlotVecEnv):
         each, rest = divmod(n_worlds, len(scenarios))
         if rest or not each:
             raise ValueError(f"n_worlds must be a multiple of the {len(scenarios)} settings; got {n_worlds}")
-        self.scenario, self.reward = largest, reward
-        self.n_worlds, self.n_agents = n_worlds, largest.pursuers
-        self.agents = list(largest.agents)
-        self.render_mode = None
         self._parts = [
             _Part(EncirclementVecEnv(s, reward, each), slice(i * each, (i + 1) * each), _columns(s, largest))
             for i, s in enumerate(scenarios)
         ]
-        spaces = spaces_of(largest)
-        (self._size,) = spaces.observation.shape
-        super().__init__(n_worlds * self.n_agents, *spaces)
+        self._size = len(bounds(largest)[0])
+        super().__init__(largest, reward, n_worlds)
+        pursuers = np.repeat([s.pursuers for s in scenarios], each)
+        self._there = np.arange(self.n_agents) < pursuers[:, None]  # whether a slot has a pursuer, (B, N)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Give every world its own random stream: ``world_seeds(seed, P)[p]`` is the seed of the worlds of part p of P.
 
         :return: the seed of each slot's world
+        :raises ValueError: for a negative seed
         """
         seeds = [part.env.seed(s) for part, s in zip(self._parts, world_seeds(seed, len(self._parts)), strict=True)]
         by_world = [s for part, own in zip(self._parts, seeds, strict=True) for s in own[:: part.env.n_agents]]
@@ -70,45 +68,28 @@ class MixedVecEnv(SlotVecEnv):
         return self._seeds
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
-        """Change what ``EncirclementVecEnv`` does; no world gets a higher speed ratio than its scenario's."""
+        """Change what ``EncirclementVecEnv`` does; no world gets a higher speed ratio than its scenario's.
+
+        :raises ValueError: for another field, or a value that a scenario would not take
+        """
         for part in self._parts:
             own = difficulty.copy()
             if "speed_ratio" in own:
                 own["speed_ratio"] = min(own["speed_ratio"], part.env.scenario.speed_ratio)
             part.env.set_difficulty(own)
 
-    def reset(self) -> NDArray[np.float32]:
-        """Start a new round in every world.
-
-        :return: observations, (B * N, O)
-        """
-        self._reset_seeds()
-        self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._padded([part.env.reset() for part in self._parts])
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions for ``step_wait``.
-
-        :param actions: one row a slot, in [-1, 1], (B * N, 2)
-        :raises ValueError: for a wrong shape
-        :raises RuntimeError: if no round is running
-        """
-        actions = np.asarray(actions)
-        shape = (self.num_envs, ACTION_SIZE)
-        if actions.shape != shape:
-            raise ValueError(f"actions must have shape {shape}, one row a slot; got {actions.shape}")
-        by_world = actions.reshape(self.n_worlds, self.n_agents, ACTION_SIZE)
-        for env, worlds, _ in self._parts:
-            env.step_async(by_world[worlds, : env.n_agents].reshape(-1, ACTION_SIZE))
-
     def step_wait(self) -> VecEnvStepReturn:
         """Move all worlds by one step; worlds whose round ended start the next one.
 
         :return: observations (B * N, O), rewards (B * N,), dones (B * N,), infos
-        :raises ValueError: for an action that is not finite, naming world of its setting and pursuer
+        :raises ValueError: for an action that is not finite, naming world and pursuer; nothing moves then
+        :raises PlacementError: if the bodies of a new round cannot be placed
         """
-        observations, rewards, dones, infos = zip(*(part.env.step_wait() for part in self._parts), strict=True)
+        self._check_finite()
+        steps = [
+            env.step(self._actions[worlds, : env.n_agents].reshape(-1, ACTION_SIZE)) for env, worlds, _ in self._parts
+        ]
+        observations, rewards, dones, infos = zip(*steps, strict=True)
         padded_rewards = np.zeros((self.n_worlds, self.n_agents), rewards[0].dtype)
         padded_dones = np.empty((self.n_worlds, self.n_agents), np.bool_)
         padded_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -133,7 +114,20 @@ class MixedVecEnv(SlotVecEnv):
 
         :return: the present observations, (B * N, O)
         """
-        return self._padded([part.env.set_state(s) for part, s in zip(self._parts, saved["parts"], strict=True)])
+        observations = [part.env.set_state(s) for part, s in zip(self._parts, saved["parts"], strict=True)]
+        self._running = True
+        return self._padded(observations)
+
+    def _start(self) -> NDArray[np.float32]:
+        return self._padded([part.env.reset() for part in self._parts])
+
+    def _check_finite(self) -> None:
+        """Raise a ValueError for what a part would refuse after the parts before it have moved."""
+        wrong = np.argwhere(self._there & ~np.isfinite(self._actions).all(axis=2))
+        if len(wrong):
+            world, pursuer = wrong[0].tolist()
+            action = self._actions[world, pursuer]
+            raise ValueError(f"the action of {self.agents[pursuer]} in world {world} is not finite: {action}")
 
     def _infos_of_world(self, part: _Part, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the infos of all slots of a world whose round has ended."""

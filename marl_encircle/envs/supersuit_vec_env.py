@@ -85,19 +85,22 @@ class SuperSuitVecEnv(VecEnv):
 
         :param seed: if given, as :meth:`seed`
         :return: first observations (B*N, O)
+        :raises RuntimeError: if one is missing, does not fit its space or is not finite; names the world and the agent
         """
         # SB3VecEnvWrapper.reset does not hand its seed on.
         if seed is not None:
             self.seed(seed)
         first_slots = range(0, self.num_envs, self.n_agents)
-        observations = [
+        first_observations = [
             slots.reset(seed=self._seeds[first], options=self._options[first] or None)[0]
             for slots, first in zip(self._converted, first_slots, strict=True)
         ]
         self._reset_seeds()
         self._reset_options()
         self._collect_reset_infos()
-        return np.concatenate(observations)
+        observations = np.concatenate(first_observations)
+        self._check_finite("observation", observations)
+        return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions of the coming step.
@@ -117,16 +120,25 @@ class SuperSuitVecEnv(VecEnv):
         """Step all worlds; those whose episode ends go on with the first observations of the next one.
 
         :return: observations (B*N, O), rewards (B*N), dones (B*N) and infos (B*N) of this step
-        :raises RuntimeError: if agents of one world end at different steps; names the world and the agents
+        :raises RuntimeError: if agents of one world end at different steps, or what the world tells one is missing, has
+            another shape or is not finite; names the world and the agents
         """
         actions = self._actions.reshape(self.n_worlds, self.n_agents, *self._actions.shape[1:])
         steps = [slots.step(joint_action) for slots, joint_action in zip(self._converted, actions, strict=True)]
-        observations, rewards, terminations, truncations, infos = zip(*steps, strict=True)
+        *arrays, world_infos = zip(*steps, strict=True)
+        observations, rewards, terminations, truncations = map(np.concatenate, arrays)
+        infos = [info for world in world_infos for info in world]
         # SuperSuit's flags are uint8, whose ~ is not a negation.
-        dones = (np.concatenate(terminations) | np.concatenate(truncations)).astype(bool)
+        dones = (terminations | truncations).astype(bool)
+        self._check_finite("reward", rewards)
+        self._check_finite("observation", observations)
         if dones.any():
             self._collect_reset_infos()
-        return np.concatenate(observations), np.concatenate(rewards), dones, [info for world in infos for info in world]
+            last_observations = observations.copy()
+            for slot in np.flatnonzero(dones):
+                last_observations[slot] = infos[slot]["terminal_observation"]
+            self._check_finite("last observation", last_observations)
+        return observations, rewards, dones, infos
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Read an attribute of each slot's world."""
@@ -165,6 +177,13 @@ class SuperSuitVecEnv(VecEnv):
     def _name(self, slot: int) -> str:
         return f"world {slot // self.n_agents}, agent {self.agents[slot % self.n_agents]!r}"
 
+    def _check_finite(self, what: str, values: NDArray[Any]) -> None:
+        """Refuse what makes a learner's weights NaN: many steps later its actions would get the blame."""
+        finite = np.isfinite(values)
+        if not finite.all():
+            slot, *place = np.argwhere(~finite)[0].tolist()
+            raise RuntimeError(f"{self._name(slot)}: {what}{place or ''} is {values[slot, *place]}; it must be finite")
+
     def _check_shape(self, actions: Any) -> None:
         shape = self.action_space.shape or ()
         if isinstance(actions, np.ndarray) and actions.shape == (self.num_envs, *shape):
@@ -186,6 +205,8 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
     def __init__(self, world: World, index: int) -> None:
         super().__init__(world)
         self.possible_agents = world.possible_agents
+        self.everyone = frozenset(world.possible_agents)
+        self.observation_shape = world.observation_space(world.possible_agents[0]).shape or ()
         self.index = index
         self.reset_infos: list[dict[str, Any]] = []
         if not hasattr(world.unwrapped, "render_mode"):  # MarkovVectorEnv reads it, PettingZoo does not ask for it
@@ -195,7 +216,7 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._check_complete(observations)
+        self._check_told("observation", observations, self.observation_shape)
         self.reset_infos = [dict(infos.get(agent, {})) for agent in self.possible_agents]
         # MarkovVectorEnv lays the infos of an automatic reset over those of the last step: leave it none.
         return observations, {}
@@ -204,7 +225,10 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        self._check_complete(observations)
+        self._check_told("observation", observations, self.observation_shape)
+        self._check_told("reward", rewards, ())
+        self._check_complete("termination", terminations)
+        self._check_complete("truncation", truncations)
         # MarkovVectorEnv plays on until all have ended, without a terminal_observation for those who ended before.
         ended = [agent for agent in self.possible_agents if terminations[agent] or truncations[agent]]
         if 0 < len(ended) < len(self.possible_agents):
@@ -219,9 +243,22 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         }
         return observations, rewards, terminations, truncations, infos
 
-    def _check_complete(self, observations: dict[str, Any]) -> None:
-        if absent := [agent for agent in self.possible_agents if agent not in observations]:
-            raise RuntimeError(f"world {self.index}: no observation of {absent}; all must take part in every step")
+    def _check_told(self, what: str, told: dict[str, Any], shape: tuple[int, ...]) -> None:
+        """Refuse what MarkovVectorEnv cannot stack, or makes something else of: a missing reward is 0 to it."""
+        self._check_complete(what, told)
+        for agent in self.possible_agents:
+            # np.shape takes as long for one float as all that SuperSuit does with the rewards.
+            known = () if isinstance(told[agent], float) else getattr(told[agent], "shape", None)
+            if known != shape and np.shape(told[agent]) != shape:
+                expected = f"its space has {shape}" if shape else "expected a single number"
+                raise RuntimeError(
+                    f"world {self.index}, agent {agent!r}: {what} has shape {np.shape(told[agent])}, {expected}"
+                )
+
+    def _check_complete(self, what: str, told: dict[str, Any]) -> None:
+        if not told.keys() >= self.everyone:
+            absent = [agent for agent in self.possible_agents if agent not in told]
+            raise RuntimeError(f"world {self.index}: no {what} of {absent}; all must take part in every step")
 
 
 def _check_worlds(worlds: Sequence[Any]) -> None:

@@ -9,8 +9,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.core.simulator import Difficulty, world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE, Arena, spaces_of
+from marl_encircle.core.simulator import Difficulty, Simulator, world_seeds
+from marl_encircle.envs.arena import Arena
 from marl_encircle.envs.slot_vec_env import SlotVecEnv
 
 
@@ -27,6 +27,7 @@ class EncirclementVecEnv(SlotVecEnv):
     :param reward: the reward, and the closure rule that ends a round
     :param n_worlds: B
     :param seed: see :meth:`seed`
+    :raises ValueError: for fewer than one world
     """
 
     def __init__(
@@ -36,65 +37,38 @@ class EncirclementVecEnv(SlotVecEnv):
         n_worlds: int = 1,
         seed: int | None = None,
     ) -> None:
-        self.scenario = scenario or Scenario()
-        self.reward = reward or Reward()
-        self.n_worlds, self.n_agents = n_worlds, self.scenario.pursuers
-        self.agents = list(self.scenario.agents)
-        self.render_mode = None
-        self._running = False
-        self._arena = Arena(self.scenario, self.reward, n_worlds)
-        self.simulator, self.rounds = self._arena.simulator, self._arena.rounds
-        super().__init__(n_worlds * self.n_agents, *spaces_of(self.scenario))
+        self._arena = Arena(scenario or Scenario(), reward or Reward(), n_worlds)
+        super().__init__(self._arena.scenario, self._arena.reward, n_worlds)
         if seed is not None:
             self.seed(seed)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator of all worlds."""
+        return self._arena.simulator
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Give every world its own random stream from the next ``reset`` on: ``world_seeds(seed, B)[b]`` for world b.
 
         :return: the seed of each slot's world
+        :raises ValueError: for a negative seed
         """
         self._seeds = [s for s in world_seeds(seed, self.n_worlds) for _ in range(self.n_agents)]
         return self._seeds
 
     def set_difficulty(self, difficulty: Difficulty) -> None:
-        """Change speed ratio, safety distance or obstacle radius from each world's next round on."""
+        """Change speed ratio, safety distance or obstacle radius from each world's next round on.
+
+        :raises ValueError: for another field, or a value that the scenario would not take
+        """
         self.simulator.set_difficulty(difficulty)
-
-    def reset(self) -> NDArray[np.float32]:
-        """Start a new round in every world.
-
-        :return: observations, (B * N, O)
-        """
-        if self._seeds[0] is not None:
-            self.simulator.seed([int(s) for s in self._seeds[:: self.n_agents] if s is not None])
-        self._reset_seeds()
-        self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
-        observations = self._arena.reset()
-        self._running = True
-        return self._slots(observations)
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions for ``step_wait``.
-
-        :param actions: one row a slot, in [-1, 1], (B * N, 2)
-        :raises ValueError: for a wrong shape
-        :raises RuntimeError: if no round is running
-        """
-        if not self._running:
-            raise RuntimeError("no round is running: call reset() first")
-        with np.errstate(over="ignore"):  # too large for single precision is infinite, and told by name in step_wait
-            actions = np.array(actions, np.float32)
-        shape = (self.num_envs, ACTION_SIZE)
-        if actions.shape != shape:
-            raise ValueError(f"actions must have shape {shape}, one row a slot; got {actions.shape}")
-        self._actions = actions.reshape(self.n_worlds, self.n_agents, ACTION_SIZE)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Move all worlds by one step; worlds whose round ended start the next one.
 
         :return: observations (B * N, O), rewards (B * N,), dones (B * N,), infos
-        :raises ValueError: for an action that is not finite, naming world and pursuer
+        :raises ValueError: for an action that is not finite, naming world and pursuer; nothing moves then
+        :raises PlacementError: if the bodies of a new round cannot be placed
         """
         observations, rewards, terminated, truncated = self._arena.step(self._actions)
         done = terminated | truncated
@@ -102,7 +76,7 @@ class EncirclementVecEnv(SlotVecEnv):
         worlds = np.flatnonzero(done)
         if len(worlds):
             for b in worlds.tolist():
-                figures = self.rounds.summary(b)
+                figures = self._arena.rounds.summary(b)
                 for i in range(self.n_agents):
                     infos[b * self.n_agents + i] = {
                         "is_success": bool(terminated[b]),
@@ -125,6 +99,11 @@ class EncirclementVecEnv(SlotVecEnv):
         self._arena.set_state(saved)
         self._running = True
         return self._slots(self._arena.observe())
+
+    def _start(self) -> NDArray[np.float32]:
+        if self._seeds[0] is not None:
+            self.simulator.seed([int(s) for s in self._seeds[:: self.n_agents] if s is not None])
+        return self._slots(self._arena.reset())
 
     def _slots(self, per_world: NDArray[np.float32]) -> NDArray[np.float32]:
         return per_world.reshape(self.num_envs, -1)

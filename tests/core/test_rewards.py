@@ -290,6 +290,27 @@ def test_a_wrong_reward_is_an_error_that_says_where(make: Callable[[], Reward], 
         make()
 
 
+def test_numpys_numbers_are_pythons() -> None:
+    terms: dict[str, Any] = {
+        "time": np.int64(8),
+        "contraction": {"weight": np.float32(0.5), "cap": np.uint8(3)},
+        "collision": None,
+    }
+    rest: dict[str, Any] = {"closure": np.str_("pursuers"), "two_stage": np.False_, "scale": np.float32(0.25)}
+    reward = Reward(terms, **rest)
+    plain: dict[str, Any] = {"time": 8, "contraction": {"weight": 0.5, "cap": 3}, "collision": None}
+    assert repr(reward) == repr(Reward(plain, closure="pursuers", two_stage=False, scale=0.25))
+    assert repr(reward.active) == "{'contraction': (0.5, {'cap': 3}), 'time': (8.0, {})}"
+    assert isinstance(terms["time"], np.int64), "what was given stays as it was"
+
+
+@pytest.mark.parametrize("value", [np.float32("nan"), np.float64("inf"), np.True_, np.array(8), np.complex64(8)])
+def test_numpys_other_values_are_no_weights(value: Any) -> None:
+    for term in (value, {"weight": value}):
+        with pytest.raises(ValueError, match=r"terms\.time\.weight must be a finite number; got "):
+            Reward({"time": term})
+
+
 def test_a_long_name_is_quoted_in_short() -> None:
     with pytest.raises(ValueError) as caught:
         Reward({"x" * 10_000: 1.0})

@@ -91,6 +91,13 @@ def test_numpys_numbers_are_pythons() -> None:
     assert refused(pursuers=np.int64(0)).startswith("pursuers must be between 1 and 64; got ")
 
 
+@pytest.mark.parametrize("value", [True, False])
+def test_numpys_truth_values_are_pythons(value: bool) -> None:
+    scenario = Scenario(composite_unit=np.bool_(value))  # type: ignore[arg-type]
+    assert scenario.composite_unit is value
+    assert refused(composite_unit=np.int64(1)) == "composite_unit must be a bool; got 1"
+
+
 @pytest.mark.parametrize("name", [n for n, hint in HINTS.items() if get_origin(hint) is Literal])
 def test_a_choice_outside_the_list_shows_the_list(name: str) -> None:
     for value in ("nonsense", None, 1, ""):

@@ -1,10 +1,11 @@
 """The step that all engines share."""
 
 import numpy as np
+import pytest
 from gymnasium.spaces import Box
 
 from marl_encircle.core.observations import bounds
-from marl_encircle.core.rewards import Reward
+from marl_encircle.core.rewards import TERMS, Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs.arena import Arena, spaces_of
 
@@ -35,6 +36,17 @@ def test_no_world_is_both_terminated_and_truncated() -> None:
     assert np.array_equal(outcome.terminated, ~outcome.truncated)
     assert outcome.terminated.any()
     assert outcome.truncated.any()
+
+
+def test_a_reward_term_sees_the_actions_as_the_pursuers_did_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TERMS, "effort", lambda t: np.abs(t.actions).sum(axis=2))
+    arena = Arena(Scenario(), Reward({"effort": -1.0}, scale=1.0), 1)
+    arena.reset()
+    given = np.array([[[5.0, -0.25], [-1.5, 1.0], [0.0, 0.5]]])
+    kept = given.copy()
+    # 1 + 0.25, 1 + 1, 0 + 0.5
+    assert arena.step(given).rewards[0].tolist() == [-1.25, -2.0, -0.5]
+    assert np.array_equal(given, kept)
 
 
 def test_a_pursuer_sees_within_its_bounds_and_acts_along_two_axes() -> None:

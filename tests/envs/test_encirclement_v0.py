@@ -296,6 +296,14 @@ def test_terms_are_weights_or_a_reward() -> None:
     assert parallel_env().reward == Reward()
 
 
+@pytest.mark.parametrize(("name", "value"), [("scenario", Scenario(pursuers=4)), ("reward", Reward({"time": 100.0}))])
+def test_rules_and_reward_are_read_but_not_set(name: str, value: Any) -> None:
+    env = parallel_env()
+    with pytest.raises(AttributeError, match=f"'{name}' of 'EncirclementEnv' object has no setter"):
+        setattr(env, name, value)
+    assert getattr(env, name) == type(value)()
+
+
 def test_spaces_are_kept_and_one_for_each_agent() -> None:
     env = parallel_env()
     for space in (env.observation_space, env.action_space):

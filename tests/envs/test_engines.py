@@ -13,6 +13,7 @@ from marl_encircle.core.observations import layout
 from marl_encircle.core.rewards import TERMS, Reward
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
+from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.envs.encirclement_v0 import parallel_env
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
@@ -65,6 +66,15 @@ def test_no_step_comes_before_the_first_reset(make: Any) -> None:
         venv.step(actions)
     venv.reset()
     venv.step(actions)
+
+
+@pytest.mark.parametrize(("name", "value"), [("scenario", Scenario(pursuers=4)), ("reward", Reward({"time": 100.0}))])
+@pytest.mark.parametrize("make", ENGINES)
+def test_rules_and_reward_are_read_but_not_set(make: Any, name: str, value: Any) -> None:
+    venv = VecMonitor(CurriculumVecEnv(make(Scenario(), Reward(), 2), {}))
+    with pytest.raises(AttributeError, match=f"'{name}' of 'Encirclement(Vec)?Env' object has no setter"):
+        venv.set_attr(name, value)
+    assert venv.get_attr(name) == [type(value)()] * 6
 
 
 def assert_equal_infos(native_info: dict[str, Any], info: dict[str, Any], done: bool) -> None:

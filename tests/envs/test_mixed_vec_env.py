@@ -150,6 +150,39 @@ def test_sb3s_monitor_accepts_it() -> None:
     assert all(info["episode"]["l"] == 5 for info in infos)
 
 
+@pytest.mark.parametrize(("name", "value"), [("scenario", Scenario()), ("reward", Reward({"time": 100.0}))])
+def test_rules_and_reward_are_read_but_not_set(name: str, value: Any) -> None:
+    venv = make()
+    with pytest.raises(AttributeError, match=f"'{name}' of 'MixedVecEnv' object has no setter"):
+        venv.set_attr(name, value)
+    assert (venv.scenario, venv.reward) == (LARGEST, Reward())
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e39])  # 1e39 is infinite in single precision
+@pytest.mark.parametrize(("world", "pursuer"), [(0, 0), (3, 1), (5, 3)])  # of each setting, which have 3, 2 and 4
+def test_a_number_that_is_not_finite_is_refused_by_name_and_no_world_moves(
+    world: int, pursuer: int, number: float
+) -> None:
+    venv, twin = make(), make()
+    venv.reset()
+    twin.reset()
+    still = np.zeros((B * N, 2), np.float32)
+    actions = np.zeros((B, N, 2))
+    actions[world, pursuer, 1] = number
+    actions[:2, 3] = actions[2:4, 2:] = np.nan  # nobody is there
+    with pytest.raises(ValueError, match=rf"the action of pursuer_{pursuer} in world {world} is not finite: \[ *0\."):
+        venv.step(actions.reshape(-1, 2))
+    assert np.array_equal(venv.step(still)[0], twin.step(still)[0])
+
+
+def test_options_are_taken_and_forgotten() -> None:
+    venv = make()
+    venv.set_options({"anything": 1})
+    venv.reset()
+    assert venv._options == [{}] * 24
+    assert venv.reset_infos == [{}] * 24
+
+
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="n_worlds must be a multiple of the 3 settings; got 4"):
         MixedVecEnv(LARGEST, SCENARIOS, Reward(), 4)

@@ -221,6 +221,12 @@ def test_attributes_and_methods_answer_for_every_slot_asked() -> None:
     assert venv.render_mode is None
 
 
+def test_there_is_one_simulator() -> None:
+    venv = make()
+    with pytest.raises(AttributeError, match="'simulator' of 'EncirclementVecEnv' object has no setter"):
+        venv.set_attr("simulator", Simulator(Scenario(), B))
+
+
 def test_options_are_taken_and_forgotten() -> None:
     venv = make()
     venv.set_options({"anything": 1})
