@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 
-from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.replays.replay import record_first_rounds
 
 ROUNDS, LAST = 100, 20

@@ -17,7 +17,7 @@ total_timesteps = int(sys.argv[1]) if sys.argv[1:] else 600_000
 env = SuperSuitVecEnv(lambda: simple_spread_v3.parallel_env(continuous_actions=True), n_worlds=8)
 
 model = MADDPG("MlpPolicy", VecMonitor(env), seed=0, verbose=1)
-model.learn(total_timesteps, log_interval=400)
+model.learn(total_timesteps, log_interval=40)
 
 world = simple_spread_v3.parallel_env(continuous_actions=True)
 observations, _ = world.reset(seed=1)

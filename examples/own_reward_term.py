@@ -7,6 +7,7 @@ python examples/own_reward_term.py 20000      # so many agent steps, to see that
 import sys
 
 import numpy as np
+from stable_baselines3.common.evaluation import evaluate_policy
 
 from marl_encircle import MADDPG, make_vec_env
 from marl_encircle.core.rewards import TERMS, Array, Transition
@@ -29,4 +30,9 @@ own = ["reward.terms.contraction=null", "reward.terms.approach={weight: 20.0, li
 env = make_vec_env("ours", pursuers=3, obstacles=1, overrides=own)
 
 model = MADDPG("MlpPolicy", env, seed=0, verbose=1)
-model.learn(total_timesteps, log_interval=1000)
+model.learn(total_timesteps, log_interval=40)
+
+# Final worlds from the start, one round of each.
+eval_env = make_vec_env("ours", n_worlds=200, pursuers=3, obstacles=1, overrides=own, curriculum=False, seed=1)
+mean, _ = evaluate_policy(model, eval_env, n_eval_episodes=eval_env.num_envs)
+print(f"mean return of {eval_env.num_envs // 3} rounds: {mean:.2f}")

@@ -8,6 +8,7 @@ import sys
 
 import matplotlib.image
 import numpy as np
+from stable_baselines3.common.evaluation import evaluate_policy
 
 from marl_encircle import MADDPG, make_vec_env, parallel_env
 from marl_encircle.core.scenes import SCENES, Array
@@ -30,4 +31,9 @@ matplotlib.image.imsave("cross.png", world.render())
 
 env = make_vec_env("ours", scene="cross", pursuers=3, obstacles=2)
 model = MADDPG("MlpPolicy", env, seed=0, verbose=1)
-model.learn(total_timesteps, log_interval=1000)
+model.learn(total_timesteps, log_interval=40)
+
+# Final worlds from the start, one round of each.
+eval_env = make_vec_env("ours", n_worlds=200, scene="cross", pursuers=3, obstacles=2, curriculum=False, seed=1)
+mean, _ = evaluate_policy(model, eval_env, n_eval_episodes=eval_env.num_envs)
+print(f"mean return of {eval_env.num_envs // 3} rounds: {mean:.2f}")

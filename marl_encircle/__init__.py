@@ -1,7 +1,7 @@
 """Encircling a faster target with multi-agent reinforcement learning.
 
 Importing the package registers ``pettingzoo.make("parallel", "marl_encircle/encirclement-v0")``. The names below are
-imported when they are first used, so that an environment alone does not load torch.
+imported when they are first used, so that an environment alone does not load torch; ``__version__`` is read then, too.
 """
 
 from importlib import import_module
@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from marl_encircle.envs import encirclement_v0
     from marl_encircle.envs.encirclement_v0 import parallel_env
     from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
-    from marl_encircle.experiments.build import load_policy, make_vec_env
+    from marl_encircle.experiments.build import make_vec_env
+    from marl_encircle.experiments.loading import load_policy
     from marl_encircle.maddpg import MADDPG, MATD3
+
+__version__: str
 
 __all__ = [
     "MADDPG",
@@ -37,7 +40,7 @@ _HOMES = {
     "Scenario": "core.scenario",
     "SuperSuitVecEnv": "envs.supersuit_vec_env",
     "encirclement_v0": "envs.encirclement_v0",
-    "load_policy": "experiments.build",
+    "load_policy": "experiments.loading",
     "make_vec_env": "experiments.build",
     "parallel_env": "envs.encirclement_v0",
 }
@@ -48,6 +51,8 @@ pettingzoo.register("aec", "marl_encircle/encirclement-v0", f"{_ENVIRONMENT}:env
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("marl-encircle")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = f"{__name__}.{_HOMES[name]}"
@@ -55,4 +60,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *__all__, "__version__"])

@@ -19,6 +19,8 @@ LEAVES = {"train_ours": {"ours.zip"}, "own_scene": {"cross.png"}}
 PRINTS = {
     "train_ours": "nclosed after ",
     "own_environment": "return of one round: -",
+    "own_reward_term": "mean return of 200 rounds: -",
+    "own_scene": "mean return of 200 rounds: -",
     "swap_in_matd3": "MATD3: mean return -",
 }
 

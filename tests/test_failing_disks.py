@@ -1,26 +1,41 @@
 """A command whose disk fails says so in one line, ends with 1, and leaves what the same command goes on from."""
 
 import itertools
+import json
 import threading
 from pathlib import Path
 
 import pytest
 from faults import ERRNOS, failing_disk, largest_file, temporary_files
-from tiny_runs import command, contents, finished, tiny, tiny_arguments
+from tiny_runs import TINY, command, contents, copy_of_finished, finished, tiny, tiny_arguments
 
 from marl_encircle.experiments.tensorboard import EventFiles
 
 RUN = Path(*finished().parts[-3:])
 
 
+GRID = f"""
+profile: smoke
+groups:
+  - methods: [ours]
+    settings: [{{speed_ratio: 1.1, pursuers: 3, obstacles: 1}}]
+    seeds: [0]
+    overrides: {json.dumps(TINY)}
+shared: []
+"""
+
+
 def arguments_of(name: str, folder: Path) -> list[object]:
-    """A command that writes into an empty folder."""
+    """A command that writes into an empty folder, or into one with the run that it is about."""
     if name == "train":
         return [
             "train",
             *tiny_arguments("--out", str(folder), "--checkpoint-every", "1", "--no-tensorboard", "--quiet"),
         ]
-    return [name, "--grid", "smoke", "--out", folder]
+    copy_of_finished(folder / "runs")
+    grid = folder.with_name("grid.yaml")  # on a disk that works
+    grid.write_text(GRID)
+    return [name, "--grid", grid, "--out", folder]
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

@@ -32,10 +32,11 @@ from tiny_runs import TINY, command, copy_of_finished, finished, tiny, tiny_argu
 from marl_encircle import files, load_policy
 from marl_encircle.experiments import checkpoint, train
 from marl_encircle.experiments import grid as grids
-from marl_encircle.experiments.build import load_run, policy_bytes
+from marl_encircle.experiments.build import policy_bytes
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.episodes import Episode, episodes_from_csv
 from marl_encircle.experiments.learning_curve import curve_from_csv
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
 from marl_encircle.experiments.records import read_runs
 from marl_encircle.experiments.yaml_files import ConfigError

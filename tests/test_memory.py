@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import command, everything_in, finished, tiny_arguments
 
-from marl_encircle.experiments import trainable
+from marl_encircle.experiments import memory
 from marl_encircle.experiments.search_space import load_space
 
 COMMANDS = {
@@ -26,7 +26,7 @@ COMMANDS = {
 def limit_to(n_bytes: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Be in a container with so much memory."""
     (folder / "memory.max").write_text(str(n_bytes))
-    monkeypatch.setattr(trainable, "CONTAINER_LIMIT", folder / "memory.max")
+    monkeypatch.setattr(memory, "CONTAINER_LIMIT", folder / "memory.max")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -58,7 +58,7 @@ def test_trainings_of_a_search_are_counted_side_by_side_and_at_their_largest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("optuna")
-    largest = sum(trainable.memory_needed(load_space("default").largest).values())
+    largest = sum(memory.memory_needed(load_space("default").largest).values())
     limit_to(2 * largest + 1, tmp_path, monkeypatch)
     done = command(capsys, monkeypatch, "tune", "--jobs", "3", "--out", tmp_path / "search")
     assert (done.code, done.out) == (2, "")

@@ -115,10 +115,10 @@ ALLOWED = {
     "locks.py": ["open"],  # without waiting, and never to be read as a file
     "core/compilation.py": ["read_bytes"],  # the package's own sources
     "maddpg/saving.py": ["open"],  # to write
-    "experiments/build.py": ["is_zipfile", "is_zipfile"],  # of what is a file
     "experiments/checkpoint.py": ["safe_open"],  # once it has been opened as a regular file
+    "experiments/loading.py": ["is_zipfile", "is_zipfile"],  # of what is a file
+    "experiments/memory.py": ["read_text"],  # the kernel's limit
     "experiments/provenance.py": ["read_bytes", "read_text"],  # the package's own sources, the kernel's list
-    "experiments/trainable.py": ["read_text"],  # the kernel's limit
     "experiments/train.py": ["read_bytes"],  # what this process has just written,
     "cli/results.py": ["read_text"],  # too
     "cli/sweeps.py": ["read_text"],  # too

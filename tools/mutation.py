@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / ".cache" / "mutation" / "results.jsonl"
 LEAST_SCORE = 0.85
 
-EXPERIMENTS = ("config", "faults", "overrides", "sections", "sizes", "trainable", "yaml_files")
+EXPERIMENTS = ("config", "faults", "memory", "overrides", "sections", "sizes", "trainable", "yaml_files")
 MODULES = (
     *(f"core/{path.name}" for path in sorted((ROOT / "marl_encircle" / "core").glob("[a-z]*.py"))),
     *(f"maddpg/{path.name}" for path in sorted((ROOT / "marl_encircle" / "maddpg").glob("[a-z]*.py"))),

@@ -35,8 +35,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {}
 """What the help of each command teaches by."""
 
 
-def _add(name: str, command: Callable[..., None], panel: str, *examples: str) -> None:
-    """Add a command with its docstring as its help, at whatever width, and its examples below the options."""
+def _add(name: str, command: Callable[..., None], panel: str, *examples: str, surplus: bool = False) -> None:
+    """Add a command with its docstring as its help, at whatever width, and its examples below the options.
+
+    :param surplus: whether the command itself refuses what it does not know as an argument
+    """
     paragraphs = cleandoc(command.__doc__ or "").split("\n\n")
     group, _, last = name.rpartition(" ")
     EXAMPLES[name] = examples
@@ -45,13 +48,22 @@ def _add(name: str, command: Callable[..., None], panel: str, *examples: str) ->
         help="\n\n".join(escape(re.sub(r"\s+", " ", paragraph)) for paragraph in paragraphs),
         epilog="\n".join(["[bold]Examples[/bold]", *(f"  {NAME} {name} {escape(line)}" for line in examples)]),
         rich_help_panel=panel,
+        context_settings={"allow_extra_args": surplus},
     )(command)
 
 
 ONE, MANY, STUDY, ABOUT = "One run", "Many runs", "What runs show", "Settings and surroundings"
 RUN = "results/runs/ours/ratio1.1_n3_m1_random/seed0"
 
-_add("train", runs.train_command, ONE, "--pursuers 3 --obstacles 1", "--reward model_b --set training.n_worlds=32")
+_add(
+    "train",
+    runs.train_command,
+    ONE,
+    "--pursuers 3 --obstacles 1 --seed 7",
+    "--reward model_b --set training.n_worlds=32 --seed 7",
+    "--set training.world_steps=20000 --out short/runs",
+    surplus=True,
+)
 _add("evaluate", runs.evaluate, ONE, RUN, f"{RUN} --scene tunnel", f"{RUN} --episodes 1000 --seed 77 --json")
 _add("watch", watching.watch, ONE, "ours --pursuers 3 --obstacles 1", "ours --versus model_b --save round.gif")
 _add("export", runs.export, ONE, RUN, f"{RUN} --to torchscript --out pursuers.pt --json")
@@ -69,7 +81,7 @@ _add("tune", tuning.tune_command, MANY, "--trials 30 --jobs 2", "my_search.yaml 
 _add("reproduce-tables", results.reproduce_tables, MANY, "--grid committed --jobs 2", "--grid smoke --out trial --json")
 _add("tables", results.tables, STUDY, "--grid committed")
 _add("figures", results.figures, STUDY, "--grid committed")
-_add("report", results.report_command, STUDY, "--grid committed")
+_add("report", results.report_command, STUDY, "--grid committed", "--results trial")
 _add("tensorboard", tensorboard.tensorboard_command, STUDY, "", "--out trial --port 6010")
 _add("verify-results", results.verify_results, STUDY, "--grid committed")
 _add("config show", configs.show, ABOUT, "--reward ma2019 --pursuers 4", "--scenario paper --json")

@@ -6,19 +6,33 @@ import platform
 from collections import Counter
 from importlib import metadata
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 from packaging.requirements import Requirement
 
-from marl_encircle.cli.options import AsJson, Results
+from marl_encircle.cli.options import OUTPUT, AsJson
 from marl_encircle.cli.printing import print_pairs
 from marl_encircle.experiments.library import Kind, files_of
+from marl_encircle.experiments.yaml_files import ConfigError
 
 NAME = "marl-encircle"
 
 
-def info(out: Results = Path("results"), as_json: AsJson = False) -> None:
+def info(
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            "--out",
+            metavar="DIR",
+            rich_help_panel=OUTPUT,
+            help="Folder of runs/.",
+            show_default="results, and the package's own",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Print what is installed and found here: for a report of a fault, or to see what there is.
 
     Versions and commit, the machine, optional parts, configurations, runs. None of your environment variables.
@@ -87,11 +101,18 @@ def _is_there(requirement: Requirement) -> bool:
     return bool(requirement.specifier.contains(version, prereleases=True))
 
 
-def _run_folders(results: Path) -> list[Path]:
-    """Return where there are runs: in the folder of results, and with the package."""
+def _run_folders(results: Path | None) -> list[Path]:
+    """Return where there are runs: in the folder that was named, else in ``results`` and with the package.
+
+    :raises ConfigError: if what was named holds none
+    """
     from marl_encircle.experiments.pretrained import pretrained_runs
 
-    folders = {folder.resolve(): folder for folder in (pretrained_runs(), results / "runs")}
+    if results is not None:
+        if not (results / "runs").is_dir():
+            raise ConfigError(f"{results / 'runs'}: no such folder; --results is the folder that holds runs/")
+        return [results / "runs"]
+    folders = {folder.resolve(): folder for folder in (pretrained_runs(), Path("results/runs"))}
     return [folder for folder in folders.values() if folder.is_dir()]
 
 

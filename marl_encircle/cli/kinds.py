@@ -1,32 +1,27 @@
 """Which kind of file of ours a name or a path means, and how each kind is checked."""
 
-import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments.config import load_config
-from marl_encircle.experiments.faults import explain
-from marl_encircle.experiments.grid import GridConfig, load_grid
+from marl_encircle.experiments.faults import section_of
+from marl_encircle.experiments.grid import GridConfig, load_grid, naming_file
 from marl_encircle.experiments.library import Kind, files_of, find_file, is_path, load_section
+from marl_encircle.experiments.overrides import SECTION_KEYS
 from marl_encircle.experiments.records import run_path
 from marl_encircle.experiments.search_space import SearchFile, load_space
-from marl_encircle.experiments.sections import AlgorithmConfig, EvaluationConfig, RewardConfig, TrainingConfig
+from marl_encircle.experiments.sections import EvaluationConfig, TrainingConfig
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 from marl_encircle.spelling import nearest
 from marl_encircle.study.protocol import Protocol, load_protocol
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
-KEYS: Mapping[Kind, Collection[str]] = {
-    "reward": RewardConfig.model_fields,
-    "scenario": [field.name for field in dataclasses.fields(Scenario)],
-    "algorithm": AlgorithmConfig.model_fields,
-    "training": TrainingConfig.model_fields,
-    "evaluation": EvaluationConfig.model_fields,
+KEYS: Mapping[str, Collection[str]] = {
+    **SECTION_KEYS,
     "grid": GridConfig.model_fields,
     "protocol": Protocol.model_fields,
     "tuning": SearchFile.model_fields,
@@ -88,11 +83,9 @@ def _grid(name: str) -> dict[str, Any]:
 
 def _section(kind: Kind, model: type[BaseModel]) -> Callable[[str], dict[str, Any]]:
     def checked(name: str) -> dict[str, Any]:
-        try:
-            return {kind: model(**load_section(kind, name)).model_dump()}
-        except ValidationError as error:
-            path = find_file(name, kind)
-            raise ConfigError("\n".join(f"{path}: {kind}.{line}" for line in explain(error, model))) from error
+        values = load_section(kind, name)
+        with naming_file(find_file(name, kind)):
+            return {kind: section_of(model, values, within=kind).model_dump()}
 
     return checked
 

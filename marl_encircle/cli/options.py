@@ -63,7 +63,13 @@ Algorithm = Annotated[
 ]
 ProfileOption = Annotated[Profile, typer.Option(help="full, or smoke for a few seconds.")]
 Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override section.key=value. May be repeated.")
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override section.key=value. May be repeated. Sections: reward, scenario, algorithm, training, "
+        "evaluation; keys: marl-encircle config show.",
+    ),
 ]
 GridOption = Annotated[
     str,
@@ -73,13 +79,15 @@ GridOption = Annotated[
         help="Whose runs: committed, smoke, all, or the path of a YAML file.",
     ),
 ]
-Out = Annotated[Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs.")]
+Out = Annotated[
+    Path, typer.Option(metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs; its parent is --results elsewhere.")
+]
 Results = Annotated[
     Path,
     typer.Option("--results", "--out", metavar="DIR", rich_help_panel=OUTPUT, help="Folder of runs/ and tables/."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print one JSON object.")]
-Quiet = Annotated[bool, typer.Option("--quiet", rich_help_panel=OUTPUT, help="No progress bar.")]
+Quiet = Annotated[bool, typer.Option("--quiet", rich_help_panel=OUTPUT, help="Print the result alone.")]
 Jobs = Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time, one processor core each.")]
 ExecutorOption = Annotated[
     ExecutorName,

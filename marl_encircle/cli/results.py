@@ -4,14 +4,17 @@ A grid is read before anything slow is imported: what is wrong with it is told a
 """
 
 import json
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tqdm import tqdm
 
+from marl_encircle.cli.completion import names_of
 from marl_encircle.cli.options import Address, AsJson, ExecutorOption, GridOption, Jobs, Quiet, Results, make_executor
 from marl_encircle.cli.printing import exit_if_failed
+from marl_encircle.experiments.yaml_files import ConfigError
 
 if TYPE_CHECKING:
     from marl_encircle.experiments.grid import Grid
@@ -22,9 +25,9 @@ def tables(grid: GridOption = "committed", out: Results = Path("results")) -> No
     from marl_encircle.experiments.grid import load_grid
 
     wanted = load_grid(grid)
+    _check_runs(grid, wanted, out)
     from marl_encircle.study.reproduce import write_tables
 
-    _warn_of_no_runs(wanted, out)
     for path in write_tables(wanted, out):
         typer.echo(str(path))
 
@@ -34,22 +37,41 @@ def figures(grid: GridOption = "committed", out: Results = Path("results")) -> N
     from marl_encircle.experiments.grid import load_grid
 
     wanted = load_grid(grid)
+    _check_runs(grid, wanted, out)
     from marl_encircle.study.figures.write import write_figures
 
-    _warn_of_no_runs(wanted, out)
     for path in write_figures(wanted, out):
         typer.echo(str(path))
 
 
-def report_command(grid: GridOption = "committed", out: Results = Path("results")) -> None:
+def report_command(
+    grid: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GRID",
+            autocompletion=names_of("grid"),
+            help="Whose runs: committed, smoke, all, or the path of a YAML file.",
+            show_default="committed; all runs where it has none",
+        ),
+    ] = None,
+    out: Results = Path("results"),
+) -> None:
     """Write report.html: tables, learning curves and a player of rounds, in one file that needs no network."""
     from marl_encircle.experiments.grid import load_grid
 
-    wanted = load_grid(grid)
+    name = grid or "committed"
+    wanted = load_grid(name)
+    asked, others = _ended_runs(wanted, out / "runs")
+    shows_all = grid is None and bool(others) and not asked
+    if not shows_all:
+        _check_runs(name, wanted, out)
+        if grid is None and others:
+            number = f"{len(others)} run{'s' if len(others) > 1 else ''}"
+            typer.echo(f"left out: {number} that the grid {name} does not ask for, such as {others[0]}", err=True)
+    typer.echo("playing the first rounds of every cell again, about a second each", err=True)
     from marl_encircle.study.report.write import write_report
 
-    _warn_of_no_runs(wanted, out)
-    typer.echo(str(write_report(wanted, out)))
+    typer.echo(str(write_report(None if shows_all else wanted, out)))
 
 
 def reproduce_tables(
@@ -74,7 +96,7 @@ def reproduce_tables(
     if as_json:
         typer.echo(json.dumps({**counts, "failed": len(done.sweep.failed), "diverged": done.sweep.diverged}))
     else:
-        for number in (2, 3, 4):
+        for number in (2, 3, 4) if done.has_tables else ():
             typer.echo((out / "tables" / f"table{number}.md").read_text(encoding="utf-8"))
         typer.echo(" ".join(f"{name}={count}" for name, count in counts.items()))
     exit_if_failed(done.sweep)
@@ -111,12 +133,29 @@ def verify_results(
         raise typer.Exit(3)
 
 
-def _warn_of_no_runs(grid: "Grid", out: Path) -> None:
-    from marl_encircle.experiments.records import run_path
-
+def _check_runs(name: str, grid: "Grid", out: Path) -> None:
+    """Refuse a folder without a run of the grid: what is made there would show none, in place of what is there."""
     runs = out / "runs"
-    if not any((runs / run_path(job.config.cell, job.seed)).is_dir() for job in grid.jobs):
-        typer.echo(f"warning: {runs} has no run of this grid; what is made shows none", err=True)
+    asked, others = _ended_runs(grid, runs)
+    if asked:
+        return
+    fault = f"no run of the grid {name} has ended there"
+    if not runs.is_dir():
+        fault = f"no such folder, so no run of the grid {name}"
+    advice = f"train them: {shlex.join(['marl-encircle', 'sweep', name, '--out', str(runs)])}"
+    if others:
+        advice += f". There are others, such as {others[0]}: --grid takes the name or the YAML file of their grid"
+    raise ConfigError(f"{runs}: {fault}; {advice}")
+
+
+def _ended_runs(grid: "Grid", runs: Path) -> tuple[list[Path], list[Path]]:
+    """Return the runs below a folder that have ended, those that a grid asks for and the others."""
+    from marl_encircle.experiments.records import RECORD, run_path
+
+    asked = {run_path(job.config.cell, job.seed) for job in grid.jobs}
+    ended = {path.parent.relative_to(runs) for path in runs.glob(f"[!.]*/[!.]*/seed*/{RECORD}")}
+    # Asked for one by one: glob passes over what cannot be read.
+    return [run for run in asked if (runs / run / RECORD).exists()], sorted(ended - asked)
 
 
 def _advance(bar: Any, done: int, total: int) -> None:

@@ -30,10 +30,14 @@ from marl_encircle.experiments.choices import Engine, ExportFormat
 from marl_encircle.experiments.yaml_files import ConfigError
 
 if TYPE_CHECKING:
+    from marl_encircle.experiments.metrics import RunSummary
     from marl_encircle.experiments.tensorboard import Draw
+
+RunFolder = Annotated[Path, typer.Argument(help="A finished run folder, as train prints it.")]
 
 
 def train_command(
+    ctx: typer.Context,
     reward: RewardOption = "ours",
     algorithm: Algorithm = "maddpg",
     seed: Annotated[int, typer.Option(metavar="SEED", help="Training seed.")] = 0,
@@ -64,7 +68,12 @@ def train_command(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped."""
+    """Train one run, evaluate it, and print its folder; an interrupted run resumes where it stopped.
+
+    A shorter training: --set training.world_steps=20000.
+    """
+    if ctx.args:
+        raise ConfigError(f"unexpected argument {ctx.args[0]:.80}; did you mean --reward {ctx.args[0]:.80}?")
     config = read_config(
         reward,
         algorithm=algorithm,
@@ -95,6 +104,8 @@ def train_command(
         typer.echo("already finished", err=True)
     if diverged:
         typer.echo("diverged: the run is kept and counted as diverged; try another seed or configuration", err=True)
+    elif not (quiet or as_json):
+        _print_rounds(folder, record)
     typer.echo(json.dumps(_outcome(folder, record)) if as_json else str(folder))
     if diverged:
         raise typer.Exit(1)
@@ -111,30 +122,54 @@ def _thumbnails(quiet: bool) -> "Draw | None":
     return thumbnails
 
 
+def _print_rounds(folder: Path, record: dict[str, Any]) -> None:
+    """Say beside the output, which scripts read the folder from, how the evaluation rounds of a run ended."""
+    own = _summary(folder, record)
+    if own is None:
+        return
+    low, high = own.success_interval
+    line = f"success {100 * own.success:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of {own.rounds} rounds"
+    if own.mean_episode_length is not None:
+        line += f"; mean length of the successful ones: {own.mean_episode_length:.1f} steps"
+    typer.echo(line, err=True)
+
+
 def _outcome(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
     """Return what became of a run; one that diverged has no rounds, and so no success."""
-    from marl_encircle.experiments.metrics import summarise_run
-    from marl_encircle.experiments.records import episodes_name, read_episodes
-
-    success = length = None
-    if episodes_name() in record["sha256"]:
-        own = summarise_run(read_episodes(folder, record), record["config"]["reward"]["closure"])
-        success, length = own.success, own.mean_episode_length
+    own = _summary(folder, record)
     return {
         "folder": str(folder),
         "status": record["status"],
-        "success": success,
-        "mean_episode_length": length,
+        "success": own and own.success,
+        "mean_episode_length": own and own.mean_episode_length,
         "world_steps": record.get("world_steps"),
         "cpu_seconds": record.get("cpu_seconds"),
     }
 
 
+def _summary(folder: Path, record: dict[str, Any]) -> "RunSummary | None":
+    """Return how the rounds of a run ended under its method's own closure rule; None without any."""
+    from marl_encircle.experiments.metrics import summarise_run
+    from marl_encircle.experiments.records import episodes_name, read_episodes
+
+    if episodes_name() not in record["sha256"]:
+        return None
+    return summarise_run(read_episodes(folder, record), record["config"]["reward"]["closure"])
+
+
 def evaluate(
-    run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
+    run_dir: RunFolder,
     episodes: Annotated[
         int | None,
-        typer.Option(min=1, max=10**6, metavar="N", help="Rounds to play.", show_default="as the run's configuration"),
+        typer.Option(
+            "--episodes",
+            "--rounds",
+            min=1,
+            max=10**6,
+            metavar="N",
+            help="Rounds to play.",
+            show_default="as the run's configuration",
+        ),
     ] = None,
     seed: Annotated[
         int | None,
@@ -162,9 +197,16 @@ def evaluate(
 
     It plays in the run's own setting unless told otherwise. Any policy plays at other speed ratios and in other scenes,
     with other numbers of pursuers and obstacles only those whose features are sets.
+
+    Printed are method, setting, train_seed and eval_seed; episodes: how many rounds; closure: the method's own rule,
+    all bodies or the pursuers alone; success: the share of the rounds that end enclosed by it, with its 95 % interval
+    from success_low to success_high; mean_episode_length: the mean length of those rounds alone in steps, the paper's
+    MEL; success_all and success_pursuers: the same share by either rule; sigma_c: how unequally the pursuers
+    contribute, in radians; policy_sha256: the hash of the weights.
     """
-    from marl_encircle.experiments.build import load_run
+    _check_there(run_dir)
     from marl_encircle.experiments.evaluate import play_rounds
+    from marl_encircle.experiments.loading import load_run
     from marl_encircle.experiments.metrics import summarise_run
     from marl_encircle.experiments.records import POLICY
     from marl_encircle.experiments.train import write_episodes
@@ -213,8 +255,14 @@ def evaluate(
         print_pairs(result)
 
 
+def _check_there(run_dir: Path) -> None:
+    if not run_dir.exists():
+        name = "results/runs/METHOD/ratio<lambda>_n<n>_m<m>_<scene>/seed<s>"
+        raise ConfigError(f"{run_dir}: no such run folder; give what train printed: {name}")
+
+
 def export(
-    run_dir: Annotated[Path, typer.Argument(help="A finished run folder.")],
+    run_dir: RunFolder,
     to: Annotated[
         ExportFormat,
         typer.Option(
@@ -239,6 +287,7 @@ def export(
     observations and on those of 16 rounds it must act as the policy does, to 1e-5; else there is no file, and exit
     code 1.
     """
+    _check_there(run_dir)
     from marl_encircle.experiments.export import export_run
 
     done = export_run(run_dir, to, out)

@@ -25,9 +25,11 @@ def tensorboard_command(
 
     check_tensorboard()
     with TemporaryDirectory(prefix="marl-encircle-") as folder:
-        found = gather(out / "runs", Path(folder))
+        runs = out / "runs"
+        found = gather(runs, Path(folder))
         if not any(found):
-            raise ConfigError(f"{out / 'runs'}: no runs to show; train one, or choose another folder by --out")
+            advice = f"train one with --out {runs}, or give the folder that holds runs/ by --results"
+            raise ConfigError(f"{runs}: no runs to show; {advice}")
         typer.echo(f"runs: {found.recorded} from learning curves, {found.own} from their own event files", err=True)
         raise typer.Exit(_serve(folder, port))
 

@@ -1,9 +1,8 @@
-"""Configuration -> objects: the environment that trains, the model, and a trained policy read back."""
+"""Configuration -> objects: the environment that trains, the model, its policy."""
 
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 import safetensors.torch
@@ -11,7 +10,6 @@ import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from marl_encircle import files
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.arena import spaces_of
@@ -20,20 +18,14 @@ from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.choices import Engine, Profile
-from marl_encircle.experiments.config import MAX_POLICY_BYTES, Config, load_config
+from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
-from marl_encircle.experiments.pretrained import find_run, in_words, is_run_path, pretrained_runs, setting_of
-from marl_encircle.experiments.records import POLICY, RECORD, read_record
 from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
-from marl_encircle.maddpg.saving import load_actors
 from marl_encircle.spelling import nearest
-
-MAX_HEADER_BYTES = 1 << 16
-"""Largest header of one: names and shapes of a few arrays per layer. Each name costs memory, whatever it stands for."""
 
 
 def make_vec_env(
@@ -195,12 +187,15 @@ def build_policy(config: Config) -> MADDPGPolicy:
 
 
 def fit_policy(policy: MADDPGPolicy, config: Config) -> MADDPGPolicy:
-    """Return a policy whose features are sets, with the same weights, for other numbers of bodies.
+    """Return a policy for the bodies of a setting: of sets, one with the same weights; itself where they are its own.
 
     Draws no random numbers, as a training may be under way.
 
-    :param config: the policy's, in the setting to play in
+    :param config: the policy's, in the setting to play in; see :meth:`Config.to_play_in`
     """
+    there = config.scenario
+    if (policy.n_agents, policy.observation_space) == (there.pursuers, spaces_of(there).observation):
+        return policy
     with th.random.fork_rng(devices=[]):
         fitted = build_policy(config)
     fitted.actor.load_state_dict(policy.actor.state_dict())
@@ -211,115 +206,3 @@ def fit_policy(policy: MADDPGPolicy, config: Config) -> MADDPGPolicy:
 def policy_bytes(policy: MADDPGPolicy) -> bytes:
     """Return the actors' weights as safetensors; equal weights give equal bytes."""
     return safetensors.torch.save(policy.actor_state_dict())
-
-
-def load_policy(what: str | Path, *, trusted: bool = False, **fields: Any) -> MADDPGPolicy:
-    """Return a trained policy: one that comes with the package, by name, or that of a run folder.
-
-    Reads JSON and safetensors only, which cannot run code, and checks them against the recorded hashes.
-
-    :param what: a method's name, for its first training seed in a setting; a run folder or the ``policy.safetensors``
-        in one; or, if it is ``trusted``, a zip-file that ``MADDPG.save`` wrote, from which only the actors are taken
-    :param trusted: read a zip-file, **which can run code when it is loaded**
-    :param fields: ``speed_ratio``, ``pursuers``, ``obstacles`` and ``scene`` of a name's setting, 1.1, 3, 1 and random
-        where they are not given; or those in which the policy of a run folder shall play, if it serves any setting
-    :raises ConfigError: for a name or a setting without a policy, with those that there are and the nearest
-    :raises DamagedFileError: if a file is missing, changed, does not fit the configuration, or is not trusted
-    """
-    setting = setting_of(fields)
-    wanted = {name: value for name, value in setting._asdict().items() if name in fields}
-    if isinstance(what, str) and not is_run_path(what):
-        what, wanted = find_run(what, setting, [pretrained_runs()]), setting._asdict()
-    path = Path(what)
-    if trusted and path.is_file() and zipfile.is_zipfile(path):
-        if fields:
-            raise ConfigError(f"{what}: a zip-file has a setting of its own; got {', '.join(fields)}")
-        try:
-            return load_actors(path)
-        except Exception as error:  # unpickling raises whatever it likes
-            raise files.DamagedFileError(path, f"holds no actors: {_one_line(error)}") from error
-    return load_run(path, wanted).policy
-
-
-class LoadedRun(NamedTuple):
-    """A run read back.
-
-    :param policy: to act with
-    :param config: of the run, in the setting that was asked for
-    :param record: content of its ``run.json``
-    """
-
-    policy: MADDPGPolicy
-    config: Config
-    record: dict[str, Any]
-
-
-def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> LoadedRun:
-    """Return a run's policy, configuration and record; see :func:`load_policy`.
-
-    :param run: its folder, or the ``policy.safetensors`` in it
-    :param fields: of a setting to play in, as far as they are not the run's; only policies of sets have others
-    :raises ConfigError: for a setting that the policy does not serve
-    :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
-    """
-    folder = Path(run)
-    if folder.name == POLICY:
-        folder = folder.parent
-    if folder.is_file():
-        raise files.DamagedFileError(folder, _no_run(folder))
-    record = read_record(folder)
-    config = config_of(record, folder)
-    data = files.read_bytes(folder / POLICY, sha256=record["sha256"][POLICY], max_bytes=MAX_POLICY_BYTES)
-    policy = build_policy(config)
-    try:
-        load_weights(policy, data)
-    except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
-        reason = f"does not hold this policy's weights: {_one_line(error)}"
-        raise files.DamagedFileError(folder / POLICY, reason) from error
-    policy.set_training_mode(False)
-    trained = config.cell.setting
-    setting = trained._replace(**(fields or {}))
-    if setting != trained:
-        if config.algorithm.features != "set":
-            raise ConfigError(f"{folder} was trained {in_words(trained)}; asked for {in_words(setting)}")
-        config = config.in_setting(setting)
-        policy = fit_policy(policy, config)
-    return LoadedRun(policy, config, record)
-
-
-def load_weights(policy: MADDPGPolicy, data: bytes) -> None:
-    """Put the weights of a ``policy.safetensors`` into the actors; raise an error unless it holds just those."""
-    if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
-        raise ValueError(f"its header is larger than the {MAX_HEADER_BYTES} bytes allowed")
-    tensors = safetensors.torch.load(data)
-    for name, weights in policy.actor_state_dict().items():
-        if name in tensors and tensors[name].dtype != weights.dtype:
-            raise ValueError(f"{name} has dtype {tensors[name].dtype}")
-    policy.actor.load_state_dict(tensors)
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise ValueError("some are not finite")
-
-
-def _no_run(path: Path) -> str:
-    """Say why a file is not a run folder."""
-    if not zipfile.is_zipfile(path):
-        return "a file, not the folder of a run"
-    return (
-        "a zip-file, which can run code when it is loaded, and only safetensors and JSON are read; if it is a model "
-        "that you trust: load_policy(..., trusted=True) in Python"
-    )
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
-
-
-def config_of(record: dict[str, Any], folder: Path) -> Config:
-    """Return the configuration that the run of a folder was made with.
-
-    :raises DamagedFileError: if it is not a valid configuration
-    """
-    try:
-        return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
-    except (ValueError, RecursionError) as error:
-        raise files.DamagedFileError(folder / RECORD, f"config: {str(error)[:500]}") from error

@@ -3,6 +3,7 @@
 import csv
 import io
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -42,6 +43,9 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
 def stop_signals() -> Iterator[list[int]]:
     """Collect SIGINT and SIGTERM instead of dying of the first; a second one ends the process as usual."""
     caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught  # Python lets the main thread alone set handlers, so signals are its to handle
+        return
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def catch(number: int, _frame: FrameType | None) -> None:

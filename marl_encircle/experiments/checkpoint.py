@@ -21,7 +21,7 @@ import torch as th
 
 from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
-from marl_encircle.experiments.trainable import available_memory
+from marl_encircle.experiments.memory import available_memory
 from marl_encircle.maddpg import MADDPG
 
 NAME = "checkpoint.safetensors"
@@ -32,8 +32,8 @@ COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_re
 MONITOR = ("episode_returns", "episode_lengths")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
-MAX_HEADER_BYTES = 1 << 24
-"""Largest header, with the tree; the most worlds of the native engine need 12 MB. Each name in it costs memory."""
+MAX_TREE_HEADER = 1 << 24
+"""Largest header [bytes], with the tree: the most worlds of the native engine need 12 MB. Each name costs memory."""
 
 _FAULTS = (
     *(OSError, MemoryError, RecursionError, safetensors.SafetensorError),
@@ -97,7 +97,7 @@ def save_tree(path: Path, tree: Mapping[str, Any], former: Path | None = None) -
     text = json.dumps(_take_arrays(tree, "", arrays))
     checked = f"{files.sha256_bytes(text.encode())} {text}"
     header = _header(arrays, {"tree": checked})
-    if len(header) > MAX_HEADER_BYTES:
+    if len(header) > MAX_TREE_HEADER:
         reason = f"its header of {len(header)} bytes could not be read back; train with fewer worlds"
         raise OSError(errno.EFBIG, f"not saved: {reason}", str(path))
     pieces = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
@@ -128,8 +128,8 @@ def load_tree(path: Path) -> dict[str, Any]:
     """
     try:
         with files.open_regular(path) as start:
-            if int.from_bytes(start.read(8), "little") > MAX_HEADER_BYTES:
-                raise ValueError(f"its header is larger than the {MAX_HEADER_BYTES} bytes allowed")
+            if int.from_bytes(start.read(8), "little") > MAX_TREE_HEADER:
+                raise ValueError(f"its header is larger than the {MAX_TREE_HEADER} bytes allowed")
             if os.fstat(start.fileno()).st_size > available_memory():
                 raise ValueError("it is larger than this machine's memory")
         with safetensors.safe_open(path, framework="numpy") as file:

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import ConfigDict, ValidationError
+from pydantic import ConfigDict
 
 from marl_encircle.core.scenario import MAX_COVER, Scenario
 from marl_encircle.experiments import library
 from marl_encircle.experiments.choices import Profile
-from marl_encircle.experiments.faults import explain, naming_files
+from marl_encircle.experiments.faults import naming_files, section_of
 from marl_encircle.experiments.overrides import parse_overrides
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.sections import (
@@ -94,8 +94,9 @@ class Config(Section):
         same = (here.pursuers, here.units) == (there.pursuers, there.units)
         if not same and self.algorithm.features != "set":
             raise ConfigError(
-                f"policies of {self.reward.name} cannot play with other numbers of bodies than they were trained with; "
-                "that needs algorithm.features set"
+                f"policies of {self.reward.name} cannot play with other numbers of bodies than they were trained with, "
+                f"{there.pursuers} pursuers and {there.units} obstacles (each disc is one unless composite_unit) in "
+                f"place of {here.pursuers} and {here.units}; that needs algorithm.features set"
             )
         return config
 
@@ -184,11 +185,9 @@ def differing(here: Mapping[str, Any], there: Mapping[str, Any], absent: Any = N
 
 def _checked(scenario: Scenario, sections: Mapping[str, Any]) -> Config:
     """Return the configuration of a scenario and the plain values of the other sections."""
+    config = section_of(Config, {"scenario": scenario, **sections})
     try:
-        config = Config(scenario=scenario, **sections)
         reward = config.reward.build()
-    except ValidationError as error:
-        raise ConfigError("\n".join(explain(error, Config))) from error
     except ValueError as error:
         raise ConfigError(f"reward.{error}") from error
     if not reward.active:

@@ -33,10 +33,9 @@ def play_rounds(
     :param setting: where to play; by default where the policy was trained
     :raises ConfigError: for a setting in which it cannot play: other numbers of bodies need the features ``set``
     """
-    if setting not in (None, config.cell.setting):
-        trained, config = config.scenario, config.to_play_in(setting)
-        if (trained.pursuers, trained.units) != (config.scenario.pursuers, config.scenario.units):
-            policy = fit_policy(policy, config)
+    if setting is not None:
+        config = config.to_play_in(setting)
+        policy = fit_policy(policy, config)
     scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
     reward = config.reward.build()
     rounds: list[Episode] = []

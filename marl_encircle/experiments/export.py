@@ -24,9 +24,9 @@ from marl_encircle import files
 from marl_encircle.core.observations import layout
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import Arena
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.choices import ExportFormat
 from marl_encircle.experiments.config import Config
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import POLICY, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import NoneType
-from typing import Any, cast, get_args
+from typing import Any, TypeVar, cast, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -11,15 +11,27 @@ from marl_encircle.experiments import library
 from marl_encircle.experiments.yaml_files import ConfigError, holds
 from marl_encircle.spelling import nearest
 
+Model = TypeVar("Model", bound=BaseModel)
 
-def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
-    """Return one line for each thing that is wrong, with its key path, value and what is allowed.
 
-    :param model: what was to be built
+def section_of(model: type[Model], values: Mapping[str, Any], within: str = "") -> Model:
+    """Return the section that plain values make.
+
+    :param within: key path at which they stand
+    :raises ConfigError: with one line for each thing that is wrong
     """
+    try:
+        return model(**values)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_explain(error, model, within))) from error
+
+
+def _explain(error: ValidationError, model: type[BaseModel], within: str) -> list[str]:
+    """Return one line for each thing that is wrong, with its key path, value and what is allowed."""
     lines = []
     for item in error.errors():
-        path = ".".join(f"{part!s:.80}" for part in item["loc"] if part != "[key]")
+        parts = [f"{part!s:.80}" for part in item["loc"] if part != "[key]"]
+        path = ".".join([within, *parts] if within else parts)
         if item["type"] == "extra_forbidden":
             siblings = _known_keys(model, item["loc"][:-1])
             lines.append(f"{path:.200}: unknown key{nearest(str(item['loc'][-1]), siblings)}")

@@ -8,12 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from marl_encircle.core.scenes import SCENES
 from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.config import Config, difference, load_config
-from marl_encircle.experiments.faults import explain
+from marl_encircle.experiments.faults import section_of
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.sections import Section, SettingConfig
@@ -136,10 +136,9 @@ def load_grid(name: str) -> Grid:
     """
     read_anew()
     path = find_file(name, "grid")
-    try:
-        grid = GridConfig(**read_yaml(path))
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, GridConfig))) from error
+    values = read_yaml(path)
+    with naming_file(path):
+        grid = section_of(GridConfig, values)
 
     def beside(name: str) -> str:
         return str(path.parent / name) if is_path(name) else name

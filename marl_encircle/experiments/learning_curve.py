@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle import files
+from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import csv_lines
 from marl_encircle.experiments.records import CURVE, MAX_FILE
 
@@ -19,6 +20,20 @@ class Curve(NamedTuple):
     """When the rounds were played, rising, (P,)."""
     success: NDArray[np.float64]
     """Share of them that the method's own rule counts as a success, (P,)."""
+
+
+def count_points(config: Config) -> int:
+    """Return how many points the learning curve of a whole training has.
+
+    One comes where a rollout begins, as soon as ``curve_every`` world steps more are behind, and one at the end.
+
+    :param config: of the training; its rollouts are no longer than ``curve_every``, see
+        :func:`~marl_encircle.experiments.trainable.check_training`
+    """
+    training = config.training
+    rollout = training.n_worlds * config.algorithm.train_freq
+    last_beginning = (training.world_steps - 1) // rollout * rollout
+    return last_beginning // training.curve_every + 1
 
 
 def read_curve(folder: Path, sha256: str | None = None) -> Curve:

@@ -20,16 +20,17 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from marl_encircle import files
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
-from marl_encircle.experiments.build import load_weights, policy_bytes
+from marl_encircle.experiments.build import policy_bytes
 from marl_encircle.experiments.choices import AlgorithmName
 from marl_encircle.experiments.config import MAX_CRITIC_BYTES, MAX_POLICY_BYTES
 from marl_encircle.experiments.divergence import Diverged, fault
+from marl_encircle.experiments.loading import load_weights
+from marl_encircle.experiments.memory import available_memory, check_memory
 from marl_encircle.experiments.metrics import Interval, student_interval
 from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import git_commit, versions
 from marl_encircle.experiments.sections import MAX_LAYERS
 from marl_encircle.experiments.sizes import weights_between
-from marl_encircle.experiments.trainable import available_memory, check_memory
 from marl_encircle.experiments.worlds import MAX_ROUND, NO_END, random_actions
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG

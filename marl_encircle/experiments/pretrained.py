@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
+from marl_encircle.core.scenario import plain
 from marl_encircle.core.scenes import SCENES
-from marl_encircle.experiments.faults import explain
+from marl_encircle.experiments.faults import section_of
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.library import PACKAGE, reward_names
 from marl_encircle.experiments.records import RECORD, Cell, Setting, read_record, read_setting, run_path
@@ -40,10 +39,8 @@ def setting_of(fields: Mapping[str, Any]) -> Setting:
 
     :raises ConfigError: for an unknown field or scene, naming the nearest, and for a value of another type
     """
-    try:
-        setting = SettingConfig(**{**USUAL_SETTING._asdict(), **fields}).build()
-    except ValidationError as error:
-        raise ConfigError("\n".join(explain(error, SettingConfig))) from error
+    chosen = {name: plain(value) for name, value in fields.items()}
+    setting = section_of(SettingConfig, {**USUAL_SETTING._asdict(), **chosen}).build()
     if setting.scene not in SCENES:
         raise ConfigError(f"scene {setting.scene!r:.80}: unknown scene{nearest(setting.scene, SCENES)}")
     return setting

@@ -9,15 +9,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.faults import explain
+from marl_encircle.experiments.faults import section_of
 from marl_encircle.experiments.grid import Job, naming_file, read_anew
+from marl_encircle.experiments.learning_curve import count_points
 from marl_encircle.experiments.library import find_file, is_path
+from marl_encircle.experiments.memory import memory_needed
 from marl_encircle.experiments.sections import Section, SettingConfig
-from marl_encircle.experiments.trainable import check_seed, check_training, memory_needed
+from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError, read_yaml
 
 TUNING_SEEDS = range(900, 1000)
@@ -173,12 +175,6 @@ class Space(NamedTuple):
         values = {key: _value_at(config, key) for key in self.dimensions}
         return {key: value for key, value in values.items() if _is_tried(self.dimensions[key], value)}
 
-    @property
-    def points(self) -> int:
-        """How many points the learning curve of a training has."""
-        training = self.jobs({})[0].config.training
-        return -(-training.world_steps // training.curve_every)
-
     def to_dict(self) -> dict[str, Any]:
         """Return all that decides the worth of a trial and which ones are tried, as plain data."""
         values = self.file.model_dump(include={"seeds", "last_points", "random_trials", "pruning", "search"})
@@ -198,10 +194,7 @@ def load_space(name: str | Path) -> Space:
         if isinstance(values.get(key), str) and is_path(values[key]):
             values[key] = str(path.parent / values[key])
     with naming_file(path):
-        try:
-            file = SearchFile(**values)
-        except ValidationError as error:
-            raise ConfigError("\n".join(explain(error, SearchFile))) from error
+        file = section_of(SearchFile, values)
         space = Space(file, dict(_dimensions(file.search.model_dump(), "")))
         _check(space)
     return space
@@ -211,15 +204,13 @@ def _dimensions(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, Dim
     for key, value in values.items():
         if not isinstance(value, dict):
             raise ConfigError(f"search.{path}{key}: must be {{low, high}} or {{choices}}; got {value!r:.80}")
-        kind = Choices if "choices" in value else Range if {"low", "high"} & value.keys() else None
-        if kind is None:
+        within = f"search.{path}{key}"
+        if "choices" in value:
+            yield f"{path}{key}", section_of(Choices, value, within)
+        elif {"low", "high"} & value.keys():
+            yield f"{path}{key}", section_of(Range, value, within)
+        else:
             yield from _dimensions(value, f"{path}{key}.")
-            continue
-        try:
-            yield f"{path}{key}", kind(**value)
-        except ValidationError as error:
-            lines = explain(error, kind)
-            raise ConfigError("\n".join(f"search.{path}{key}.{line}".replace(".: ", ": ") for line in lines)) from error
 
 
 def _check(space: Space) -> None:
@@ -228,16 +219,23 @@ def _check(space: Space) -> None:
         raise ConfigError("search: nothing to search; give ranges or choices of keys of algorithm or reward")
     for job in space.jobs({}):
         check_seed(job.config, job.seed)
-    if space.file.last_points > space.points:
-        raise ConfigError(f"last_points: a learning curve has {space.points} points; got {space.file.last_points}")
+    _check_points(space, {})
     for key, dimension in space.dimensions.items():
         if key in NOT_SEARCHED:
             raise ConfigError(f"search.{key}: cannot be searched: {NOT_SEARCHED[key]}")
         for value in dimension.ends:
             try:
                 check_training(space.jobs({key: value})[0].config)
+                _check_points(space, {key: value})
             except ConfigError as error:
                 raise ConfigError(f"search.{key}: {error}") from error
+
+
+def _check_points(space: Space, values: Mapping[str, Any]) -> None:
+    """Refuse to judge a trial by more points than its learning curves have."""
+    points = count_points(space.jobs(values)[0].config)
+    if space.file.last_points > points:
+        raise ConfigError(f"last_points: a learning curve has {points} points; got {space.file.last_points}")
 
 
 def _value_at(config: Mapping[str, Any], key: str) -> Any:

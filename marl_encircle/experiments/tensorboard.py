@@ -15,10 +15,11 @@ from stable_baselines3.common import logger
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from marl_encircle import files
-from marl_encircle.experiments.build import config_of
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.descriptions import CURVES, describe
 from marl_encircle.experiments.episodes import csv_lines
+from marl_encircle.experiments.learning_curve import count_points
+from marl_encircle.experiments.loading import config_of
 from marl_encircle.experiments.records import CURVE, MAX_FILE, RECORD, read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
@@ -132,9 +133,8 @@ def is_drawn(config: Config, point: int) -> bool:
 
     :param point: its number, from 1
     """
-    training = config.training
-    points = -(-training.world_steps // training.curve_every)
-    moments = min(max(training.world_steps // WORLD_STEPS_BETWEEN, 1), MOMENTS, points)
+    points = count_points(config)
+    moments = min(max(config.training.world_steps // WORLD_STEPS_BETWEEN, 1), MOMENTS, points)
     return point * moments // points > (point - 1) * moments // points
 
 

@@ -18,13 +18,7 @@ from marl_encircle import files, locks
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint, divergence
-from marl_encircle.experiments.build import (
-    build_model,
-    build_vec_env,
-    check_engine,
-    config_of,
-    policy_bytes,
-)
+from marl_encircle.experiments.build import build_model, build_vec_env, check_engine, policy_bytes
 from marl_encircle.experiments.callbacks import (
     Checkpointer,
     LearningCurve,
@@ -38,6 +32,7 @@ from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.episodes import Episode, episodes_to_csv
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import config_of
 from marl_encircle.experiments.progress import ProgressBar
 from marl_encircle.experiments.provenance import cpu_model, git_commit, source_hash, versions
 from marl_encircle.experiments.records import (
@@ -294,4 +289,5 @@ def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> N
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)
-        raise OtherRunError(f"{folder} already holds a different run; choose another name or folder:\n  {listing}")
+        advice = "choose another --seed, --out or reward name"
+        raise OtherRunError(f"{folder} already holds a different run; {advice}:\n  {listing}")

@@ -1,15 +1,10 @@
 """What a configuration must hold to be trained on this machine; one that does not may still be shown and compared."""
 
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 from marl_encircle.experiments.config import Config, build_scenario, fields_of
-from marl_encircle.experiments.sizes import count_weights, observation_size
+from marl_encircle.experiments.memory import available_memory, check_memory, memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
-
-CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Where a container says how much memory it may have."""
 
 
 def check_seed(config: Config, seed: int) -> None:
@@ -27,7 +22,9 @@ def check_seed(config: Config, seed: int) -> None:
 
 
 def check_training(config: Config) -> None:
-    """Refuse a training that would learn nothing or not fit into this machine's memory; an environment may do both.
+    """Refuse a training that would learn nothing, not fit into this machine's memory or lack points of its curve.
+
+    An environment may do all of it.
 
     :raises ConfigError: naming the keys
     """
@@ -39,6 +36,7 @@ def check_training(config: Config) -> None:
             f"learnt; got {random}"
         )
     check_memory(memory_needed(config), available_memory())
+    _check_curve(config)
 
 
 def check_trainings(configs: Sequence[Config], at_a_time: int) -> None:
@@ -73,49 +71,11 @@ def check_curriculum(config: Config) -> None:
                 raise ConfigError(f"{key}.start: {error}; {remedy}") from error
 
 
-def check_memory(needed: Mapping[str, int], available: int) -> None:
-    """Refuse what cannot fit into this machine's memory.
-
-    :param needed: bytes by the key that asks for them
-    :param available: bytes
-    :raises ConfigError: naming the key that asks for most, with the figures
-    """
-    total = sum(needed.values())
-    if total > available:
-        key = max(needed, key=needed.__getitem__)
+def _check_curve(config: Config) -> None:
+    """Refuse a learning curve whose points would be further apart than asked for."""
+    n_worlds, train_freq, every = config.training.n_worlds, config.algorithm.train_freq, config.training.curve_every
+    if n_worlds * train_freq > every:
         raise ConfigError(
-            f"{key}: needs {needed[key] / 1e9:.1f} GB of memory, of {total / 1e9:.1f} GB in all, but this machine has "
-            f"{available / 1e9:.1f} GB"
+            f"training.curve_every: must be at least training.n_worlds * algorithm.train_freq, {n_worlds} * "
+            f"{train_freq}: a point of the learning curve comes between two rollouts; got {every}"
         )
-
-
-def memory_needed(config: Config) -> dict[str, int]:
-    """Return the least memory [bytes] that a training takes, by the key that asks for it."""
-    a, scenario = config.algorithm, config.scenario
-    n, size = scenario.pursuers, observation_size(scenario)
-    steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
-    transition = 4 * n * (2 * size + 5)  # two observations, two actions, reward, done, time limit in single precision
-    joint = 4 * n * n * (size + 2)  # each critic's input
-    hidden = 4 * n * sum(a.net_arch)
-    return {
-        "algorithm.buffer_world_steps": 2 * steps * transition,  # beside that of the checkpoint it resumes from
-        "algorithm.batch_size": a.batch_size * (transition + joint + hidden),
-        "algorithm.net_arch": 20 * sum(count_weights(scenario, a).values()),  # with targets, gradients, two moments
-        "training.n_worlds": _worlds_memory(config),
-    }
-
-
-def _worlds_memory(config: Config) -> int:
-    """Return the least memory [bytes] that worlds take: what each direction meets, twice, under both closure rules."""
-    scenario = config.scenario
-    return config.training.n_worlds * (36 * scenario.n_directions + 8 * scenario.pursuers * observation_size(scenario))
-
-
-def available_memory() -> int:
-    """Return the memory [bytes] of this machine, or of the container if that is less."""
-    installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
-        limit = CONTAINER_LIMIT.read_text().strip()
-    except OSError:
-        return installed
-    return min(installed, int(limit)) if limit.isdigit() else installed  # "max": no limit

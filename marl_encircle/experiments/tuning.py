@@ -22,7 +22,7 @@ from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor
 from marl_encircle.experiments.grid import Job
-from marl_encircle.experiments.learning_curve import read_curve
+from marl_encircle.experiments.learning_curve import count_points, read_curve
 from marl_encircle.experiments.records import CURVE
 from marl_encircle.experiments.search_space import Choices, Space
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
@@ -159,15 +159,15 @@ class _Attempt:
         record = ended_run(self.run(job), job.config, job.seed)
         return None if record is None else str(record["status"])
 
-    def curve(self, job: Job, length: int) -> list[float]:
-        """Return a training's success at each point so far; once it has diverged, 0 at those left of ``length``.
+    def curve(self, job: Job) -> list[float]:
+        """Return a training's success at each point so far; once it has diverged, 0 at those that it has not reached.
 
         :raises DamagedFileError: if its learning curve is none
         """
         if not (self.run(job) / CURVE).exists():
             return []
         curve: list[float] = read_curve(self.run(job)).success.tolist()
-        return curve + [0.0] * (length - len(curve)) if self.status(job) == "diverged" else curve
+        return curve + [0.0] * (count_points(job.config) - len(curve)) if self.status(job) == "diverged" else curve
 
 
 class _Search:
@@ -213,7 +213,7 @@ class _Search:
         attempt = self._attempt(trial)
         attempt.reported = max(self.study.trials[trial.number].intermediate_values, default=0)
         for job in attempt.waiting:
-            if attempt.curve(job, 0) or attempt.status(job):
+            if attempt.curve(job) or attempt.status(job):
                 attempt.started.append(job)
         attempt.waiting = [job for job in attempt.waiting if attempt.status(job) is None]
         self._begin(attempt)
@@ -281,7 +281,7 @@ class _Search:
 
     def _is_worse(self, attempt: _Attempt) -> bool:
         """Tell Optuna the new points, those that all seeds started so far have; return whether to give the trial up."""
-        curves = [attempt.curve(job, self.space.points) for job in attempt.started]
+        curves = [attempt.curve(job) for job in attempt.started]
         for point in range(attempt.reported + 1, min(map(len, curves), default=0) + 1):
             attempt.trial.report(mean(curve[point - 1] for curve in curves), point)
             attempt.reported = point
@@ -296,7 +296,7 @@ class _Search:
         """
         if attempt.status(job) == "diverged":
             return 0.0
-        curve = attempt.curve(job, self.space.points)
+        curve = attempt.curve(job)
         if not curve:
             raise files.DamagedFileError(attempt.run(job) / CURVE, "no learning curve: the training has finished")
         return mean(curve[-self.space.file.last_points :])

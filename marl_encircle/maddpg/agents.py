@@ -2,8 +2,24 @@
 
 from typing import Any
 
+import pettingzoo
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+
+def refuse_pettingzoo(env: GymEnv | str | None) -> None:
+    """Refuse an environment of PettingZoo, or its id: SB3 would ask Gymnasium for it.
+
+    :raises ValueError: with the call that makes a ``VecEnv`` of it
+    """
+    if isinstance(env, str):
+        if env.partition("-v")[0] in {name.partition("-v")[0] for name in pettingzoo.parallel_registry}:
+            raise ValueError(
+                f"{env!r} is an environment of PettingZoo, which learns as a VecEnv: make_vec_env(...) where it is the "
+                f'encirclement, else SuperSuitVecEnv(lambda: pettingzoo.make("parallel", {env!r}), n_worlds=...)'
+            )
+    elif hasattr(env, "possible_agents") and not isinstance(env, VecEnv):
+        raise ValueError("a PettingZoo environment learns as a VecEnv: SuperSuitVecEnv(env, n_worlds=...)")
 
 
 def count_agents(env: GymEnv | None, n_agents: int | None) -> int:

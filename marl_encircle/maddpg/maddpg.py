@@ -27,13 +27,13 @@ from stable_baselines3.common.utils import FloatSchedule, should_collect_more_st
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from marl_encircle.maddpg.agents import count_agents, names_of_agents
+from marl_encircle.maddpg.agents import count_agents, names_of_agents, refuse_pettingzoo
 from marl_encircle.maddpg.arguments import check_range, number_or_schedule
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
 from marl_encircle.maddpg.models import Actor, CentralCritic, CriticKind
 from marl_encircle.maddpg.policies import CnnPolicy, MADDPGPolicy, MlpPolicy
-from marl_encircle.maddpg.saving import UntrustedFileWarning, whole_file
+from marl_encircle.maddpg.saving import UntrustedFileWarning, saved_critics, whole_file
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 
@@ -75,6 +75,7 @@ class MADDPG(OffPolicyAlgorithm):
     :param seed: seed of the pseudo random generators
     :param kwargs: passed on to SB3's ``OffPolicyAlgorithm``
     :raises ValueError: for what MADDPG cannot do with this policy, environment or number, with what is allowed
+    :raises AssertionError: for an action space that is no bounded Box, as SB3 does
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
@@ -114,8 +115,7 @@ class MADDPG(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        if hasattr(env, "possible_agents") and not isinstance(env, VecEnv):
-            raise ValueError("a PettingZoo environment learns as a VecEnv: SuperSuitVecEnv(env, n_worlds=...)")
+        refuse_pettingzoo(env)
         if kwargs.pop("use_sde", False):
             raise ValueError("use_sde is not for deterministic actors: see exploration_noise and action_noise")
         super().__init__(
@@ -133,7 +133,6 @@ class MADDPG(OffPolicyAlgorithm):
             policy_kwargs=policy_kwargs,
             seed=seed,
             sde_support=False,
-            supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
             **kwargs,
         )
@@ -165,6 +164,11 @@ class MADDPG(OffPolicyAlgorithm):
         check_range("train_freq", self.train_freq.frequency, 1)  # type: ignore[union-attr]  # converted
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"MADDPG needs a Box observation space, but got {self.observation_space}")
+        if not isinstance(self.action_space, spaces.Box):
+            raise AssertionError(  # SB3's type for it, with a reason
+                f"MADDPG needs a Box action space, as its actors are deterministic, but got {self.action_space}. Many "
+                "environments have continuous actions by an argument, MPE's by continuous_actions=True"
+            )
         self.n_agents = count_agents(self.env, self.n_agents)
         self.agents = names_of_agents(self.env, self.n_agents) or self.agents
         if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
@@ -284,7 +288,7 @@ class MADDPG(OffPolicyAlgorithm):
         self: SelfMADDPG,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "MADDPG",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
@@ -293,12 +297,15 @@ class MADDPG(OffPolicyAlgorithm):
 
         :param total_timesteps: agent steps to train on, a lower bound
         :param callback: called at every step of the ``VecEnv``
-        :param log_interval: episodes of worlds between logs; at most one log a step
+        :param log_interval: episodes of worlds between logs, None: no logs; at most one log a step
         :param tb_log_name: name of the run for TensorBoard
         :param reset_num_timesteps: whether to count from 0 again
         :param progress_bar: whether to show one
+        :raises ValueError: for a ``log_interval`` or ``action_noise`` that does not fit
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if log_interval is not None and log_interval < 1:
+            raise ValueError(f"log_interval must be at least 1, or None for no logs, but got {log_interval}")
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]  # SB3 takes None too
 
     def _setup_learn(
         self,
@@ -392,7 +399,14 @@ class MADDPG(OffPolicyAlgorithm):
                 replaced = rng.random(n_envs) < share
                 scaled[replaced] = rng.uniform(-1, 1, (np.count_nonzero(replaced), *shape[1:]))
         if action_noise is not None:
-            scaled = scaled + action_noise()
+            noise = action_noise()
+            try:
+                scaled = scaled + np.broadcast_to(noise, shape)
+            except ValueError as error:
+                raise ValueError(
+                    f"action_noise has shape {np.shape(noise)}, but the actions of {n_envs} slots {shape}: that of one "
+                    f"slot must have shape {shape[1:]}"
+                ) from error
         scaled = np.clip(scaled, -1, 1).astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
 
@@ -521,14 +535,23 @@ class MADDPG(OffPolicyAlgorithm):
         :param print_system_info: whether to print the versions saved and in use
         :param force_reset: whether ``env`` is reset before training
         :param kwargs: attributes to change
-        :raises ValueError: where the number of agents differs
+        :raises ValueError: where the number of agents differs, or another algorithm saved it
         """
         warnings.warn(
             f"{path} is a zip-file of pickled objects, which can run code when it is loaded: load only what you trust.",
             UntrustedFileWarning,
             stacklevel=2,
         )
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except RuntimeError as error:  # PyTorch's, with the names of the weights that one has and the other has not
+            n_critics = saved_critics(path)
+            algorithms: list[type[MADDPG]] = [MADDPG, *MADDPG.__subclasses__()]
+            others = [other for other in algorithms if other.n_critics == n_critics]
+            if n_critics == cls.n_critics or not others:
+                raise
+            name = others[0].__name__
+            raise ValueError(f"{path} was saved by {name}, not by {cls.__name__}: use {name}.load") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target"]

@@ -50,7 +50,7 @@ class MATD3(MADDPG):
         self: SelfMATD3,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "MATD3",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

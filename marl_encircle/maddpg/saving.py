@@ -45,6 +45,17 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
     return policy
 
 
+def saved_critics(path: str | pathlib.Path | io.BufferedIOBase) -> int:
+    """Return how many critics each agent has in a zip-file of ``save``; only tensors are read.
+
+    :param path: the file, or an open one
+    """
+    _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
+    prefix = "critic.q_networks."
+    names = [name for name in cast(dict[str, th.Tensor], parameters.get("policy", {})) if name.startswith(prefix)]
+    return len({name.removeprefix(prefix).partition(".")[0] for name in names})
+
+
 @contextmanager
 def whole_file(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> Iterator[io.BufferedIOBase]:
     """Yield a file for SB3 to save to, which becomes ``path`` in the end; an open one is yielded itself."""

@@ -15,7 +15,7 @@ from marl_encircle.drawing.palette import LINE
 from marl_encircle.drawing.pen import SUPERSAMPLING, pygame
 from marl_encircle.drawing.render import EVERYTHING, array_of, draw_tall, draw_wide, shrunk
 from marl_encircle.drawing.view import Layers
-from marl_encircle.experiments.trainable import available_memory, check_memory
+from marl_encircle.experiments.memory import available_memory, check_memory
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.watch import Match
 

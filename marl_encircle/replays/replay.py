@@ -14,7 +14,7 @@ from marl_encircle.core.simulator import Simulator, world_seeds
 from marl_encircle.envs.arena import ACTION_SIZE, Arena
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.evaluate import WORLDS_AT_ONCE
-from marl_encircle.experiments.trainable import available_memory, check_memory
+from marl_encircle.experiments.memory import available_memory, check_memory
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 Array = NDArray[np.float64]

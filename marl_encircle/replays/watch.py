@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from marl_encircle.core.geometry import Closure
-from marl_encircle.core.observations import bounds
 from marl_encircle.drawing.view import View
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.pretrained import (
     USUAL_SETTING,
     find_run,
@@ -107,35 +106,19 @@ def find_side(
     else:  # who was not trained in a scene plays it as trained in the usual one
         trained_in = first_run(Cell(what, wanted), folders)
         folder = trained_in or find_run(what, wanted._replace(scene=USUAL_SETTING.scene), folders)
-    actors, config, record = load_run(folder, fields if policy or is_folder else _numbers(wanted))
+    numbers = fields or {} if policy or is_folder else _numbers(wanted)
+    chosen = [*numbers, *(["scene"] if scene else [])]
+    actors, config, record = load_run(folder, {name: getattr(wanted, name) for name in chosen})
     trained = config.reward.name
     if policy is not None:
         config = config.model_copy(update={"reward": load_config(what).reward})
     title = what if policy is None and not is_folder else config.reward.name
-    return Side(
-        title,
-        actors,
-        _in_scene(config, scene or config.scenario.scene, folder),
-        folder,
-        record["seed"],
-        trained if trained != title else "",
-    )
+    return Side(title, actors, config, folder, record["seed"], trained if trained != title else "")
 
 
 def _numbers(setting: Setting) -> dict[str, Any]:
     """Return a setting but for its scene."""
     return {name: value for name, value in setting._asdict().items() if name != "scene"}
-
-
-def _in_scene(config: Config, scene: str, folder: Path) -> Config:
-    """Return the configuration with another scene, which the run's policy must be able to see."""
-    try:
-        there = config.in_setting(config.cell.setting._replace(scene=scene))
-    except ConfigError as error:
-        raise ConfigError(f"scene {scene}: {error}") from error
-    if bounds(there.scenario)[0].shape != bounds(config.scenario)[0].shape:
-        raise ConfigError(f"scene {scene}: the policy of {folder} sees another number of obstacles")
-    return there
 
 
 def _is_yaml(what: str) -> bool:

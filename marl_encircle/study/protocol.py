@@ -5,10 +5,10 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from marl_encircle.experiments.choices import Profile
-from marl_encircle.experiments.faults import explain
+from marl_encircle.experiments.faults import section_of
 from marl_encircle.experiments.grid import Job, naming_file, read_anew
 from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.records import Cell, Setting
@@ -78,10 +78,9 @@ def calibrated_cells() -> list[Cell]:
 
 
 def _read(path: Path) -> Protocol:
-    try:
-        return Protocol(**read_yaml(path))
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{path}: {line}" for line in explain(error, Protocol))) from error
+    values = read_yaml(path)
+    with naming_file(path):
+        return section_of(Protocol, values)
 
 
 def _check_distinct(protocol: Protocol) -> None:

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from marl_encircle import files
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import RECORD, episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
@@ -34,6 +34,11 @@ class Reproduction(NamedTuple):
     reused: int
     sweep: Progress
 
+    @property
+    def has_tables(self) -> bool:
+        """Whether any run has ended; where none has, former tables stay as they are."""
+        return self.sweep.done + self.sweep.diverged > 0
+
 
 def reproduce(
     grid: Grid,
@@ -44,7 +49,8 @@ def reproduce(
 ) -> Reproduction:
     """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
 
-    A run whose rounds had to be played again counts as evaluated, not as reused. Arguments are those of ``sweep``.
+    A run whose rounds had to be played again counts as evaluated, not as reused. Where every run failed no table is
+    written. Arguments are those of ``sweep``.
 
     :raises DamagedFileError: if a run there is not what its record says
     """
@@ -70,9 +76,11 @@ def reproduce(
                 for setting in missing:
                     write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed, setting), setting)
                 evaluated += missing[0] is None
-    write_tables(grid, results)
     trained = progress.done + progress.diverged - progress.reused
-    return Reproduction(trained, evaluated, progress.reused - evaluated, progress)
+    done = Reproduction(trained, evaluated, progress.reused - evaluated, progress)
+    if done.has_tables:
+        write_tables(grid, results)
+    return done
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:

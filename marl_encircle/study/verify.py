@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from marl_encircle import files
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import wilson_interval
 from marl_encircle.experiments.provenance import cpu_model
 from marl_encircle.experiments.records import Cell, Setting, episodes_name, read_episodes

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -30,11 +31,11 @@ from marl_encircle.cli import kinds, machine
 from marl_encircle.experiments import executors, export, train
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments import sweep as sweeps
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import summarise_run, wilson_interval
-from marl_encircle.experiments.records import Setting
+from marl_encircle.experiments.records import Setting, read_episodes, read_record
 
 Run = Callable[..., Done]
 
@@ -59,6 +60,22 @@ def test_train_prints_its_folder_last_and_finishes_once(run: Run, runs: Path) ->
     assert (again.code, again.out, again.err) == (0, f"{folder}\n", "already finished\n")
 
 
+def test_train_says_how_its_rounds_ended(run: Run, runs: Path) -> None:
+    own = summarise_run(read_episodes(finished(), read_record(finished())), "all")
+    low, high = own.success_interval
+    said = f"success {100 * own.success:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of 8 rounds; "
+    said += f"mean length of the successful ones: {own.mean_episode_length:.1f} steps\n"
+    arguments = ("train", *tiny_arguments("--out", str(runs), "--no-tensorboard"))
+    done = run(*arguments)
+    folder = runs / "ours" / "ratio1.1_n3_m1_random" / "seed0"
+    assert (done.code, done.out) == (0, f"{folder}\n")
+    assert done.err.endswith(said)
+    assert run(*arguments).err == f"already finished\n{said}"
+    rounds = read_episodes(folder, read_record(folder))
+    train.write_episodes(folder, [each._replace(step_all=None, step_pursuers=None) for each in rounds])
+    assert re.fullmatch(r"already finished\nsuccess 0\.0 % \[0\.0, [\d.]+\] of 8 rounds\n", run(*arguments).err)
+
+
 def test_train_as_json_is_one_object(run: Run, runs: Path) -> None:
     arguments = ("train", *tiny_arguments("--out", str(runs), "--quiet", "--no-tensorboard"), "--json")
     done = run(*arguments)
@@ -81,7 +98,7 @@ def test_train_refuses_a_folder_of_another_configuration_with_the_difference(run
     before = everything_in(runs)
     done = run("train", *tiny_arguments("--out", str(runs), "--set", "algorithm.gamma=0.8"))
     assert (done.code, done.out) == (2, "")
-    assert f"{folder} already holds a different run" in done.err
+    assert f"{folder} already holds a different run; choose another --seed, --out or reward name:\n" in done.err
     assert "config.algorithm.gamma: 0.8 here, 0.9 there" in done.err
     assert everything_in(runs) == before
 
@@ -149,6 +166,12 @@ def test_a_bad_configuration_ends_with_2_and_leaves_nothing(run: Run, tmp_path: 
     assert "Traceback" not in done.err
     assert len(done.err) < 2000
     assert everything_in(tmp_path) == before
+
+
+def test_a_method_without_its_option_is_told_the_option(run: Run) -> None:
+    done = run("train", "ours", "--pursuers", "3")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "error: unexpected argument ours; did you mean --reward ours?\n"
 
 
 def test_a_locked_folder_ends_with_2_naming_pid_and_host(run: Run, runs: Path) -> None:
@@ -243,6 +266,26 @@ def test_evaluate_prints_one_object_and_reads_only(run: Run) -> None:
     assert run("evaluate", folder, "--episodes", "200", "--seed", "77", "--json") == done
     text = run("evaluate", folder, "--episodes", "200", "--seed", "77").out
     assert [line.split()[0] for line in text.splitlines()] == KEYS
+
+
+def test_the_help_explains_every_key_that_is_printed(run: Run) -> None:
+    page = run("evaluate", "--help").out
+    options = ("speed_ratio", "pursuers", "obstacles", "scene")
+    assert [key for key in KEYS if key not in options and not re.search(rf"\b{key}\b", page)] == []
+
+
+def test_rounds_are_episodes(run: Run) -> None:
+    assert run("evaluate", finished(), "--rounds", "5") == run("evaluate", finished(), "--episodes", "5")
+
+
+@pytest.mark.parametrize("name", ["evaluate", "export"])
+def test_a_folder_that_is_not_there_ends_with_2_and_how_one_is_named(run: Run, name: str) -> None:
+    done = run(name, "shy")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "error: shy: no such run folder; give what train printed: results/runs/METHOD/ratio<lambda>_n<n>_m<m>_<scene>/"
+        "seed<s>\n"
+    )
 
 
 def test_the_length_is_null_without_success(run: Run) -> None:
@@ -407,11 +450,27 @@ def test_train_without_tensorboard_ends_with_2_and_leaves_nothing(
 
 
 @pytest.mark.parametrize("name", ["tables", "figures", "report"])
-def test_a_folder_without_runs_of_the_grid_is_warned_of(run: Run, tmp_path: Path, name: str) -> None:
-    done = run(name, "--grid", "smoke", "--out", tmp_path / "mistyped")
-    assert (done.code, done.err) == (
-        0,
-        f"warning: {tmp_path / 'mistyped' / 'runs'} has no run of this grid; what is made shows none\n",
+def test_a_folder_without_runs_of_the_grid_is_refused_and_left_as_it_is(run: Run, tmp_path: Path, name: str) -> None:
+    def refusal() -> str:
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        done = run(name, "--grid", "smoke", "--out", tmp_path)
+        assert (done.code, done.out) == (2, "")
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+        return done.err
+
+    runs = tmp_path / "runs"
+    advice = f"train them: marl-encircle sweep smoke --out {runs}"
+    assert refusal() == f"error: {runs}: no such folder, so no run of the grid smoke; {advice}\n"
+    runs.mkdir()
+    for made in ("table2.md", "table_agreement.md", "table_other.csv", "table_scenes.md"):
+        files.write_text(tmp_path / "tables" / made, "of another grid")
+    assert refusal() == f"error: {runs}: no run of the grid smoke has ended there; {advice}\n"
+    (runs / "ours" / "ratio1.1_n3_m1_random" / "seed900").mkdir(parents=True)  # in training
+    assert refusal() == f"error: {runs}: no run of the grid smoke has ended there; {advice}\n"
+    copy_of_finished(runs)
+    assert refusal() == (
+        f"error: {runs}: no run of the grid smoke has ended there; {advice}. There are others, such as "
+        "ours/ratio1.1_n3_m1_random/seed0: --grid takes the name or the YAML file of their grid\n"
     )
 
 
@@ -543,6 +602,16 @@ def test_reproduce_tables_fails_if_a_run_does_and_still_renders(run: Run, tmp_pa
     assert done.code == 1
     assert done.out.splitlines()[-1] == "trained=1 evaluated=0 reused=0"
     assert "failed: ours/ratio1.1_n3_m1_random/seed7" in done.err
+
+
+@pytest.mark.usefixtures("_tiny_workers")
+def test_where_every_run_fails_former_tables_stay(run: Run, tmp_path: Path) -> None:
+    former = tmp_path / "results" / "tables" / "table2.md"
+    files.write_text(former, "of another grid")
+    done = run("reproduce-tables", "--grid", grid(tmp_path, [7]), "--out", tmp_path / "results")
+    assert (done.code, done.out) == (1, "trained=0 evaluated=0 reused=0\n")
+    assert "failed: ours/ratio1.1_n3_m1_random/seed7" in done.err
+    assert (former.read_text(), list(former.parent.iterdir())) == ("of another grid", [former])
 
 
 @pytest.mark.parametrize("name", ["sweep", "tables", "reproduce-tables"])

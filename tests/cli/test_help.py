@@ -103,6 +103,12 @@ def test_one_thread_is_all_that_torch_gets(tmp_path: Path) -> None:
     assert (tmp_path / "threads").read_text() == "1"
 
 
+def test_the_help_of_train_says_what_can_be_set_and_how_a_training_is_shortened(run: Run) -> None:
+    page = " ".join(run("train", "--help").out.replace("│", " ").split())
+    assert f"Sections: {', '.join(config.Config.model_fields)}; keys: marl-encircle config show." in page
+    assert "--set training.world_steps=20000" in page
+
+
 # examples
 
 
@@ -151,12 +157,12 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
         search_file(Path.cwd()).rename("my_search.yaml")
         arguments += ["--trials", "1"]
     if arguments[0] == "train":
-        arguments += tiny_arguments("--out", "elsewhere")
+        arguments += tiny_arguments()
     if arguments[0] == "export" and "--to" not in arguments:
         pytest.importorskip("onnxscript")
     if arguments[0] == "play-with":
         arguments += ["--world-steps", "200", "--episodes", "5"]
-    if arguments[0] == "verify-results":
+    if arguments[0] in ("tables", "figures", "report", "verify-results"):
         assert checkout("reproduce-tables", "--grid", "smoke").code == 0
     done = checkout(*arguments)
     if example == "watch ours --pursuers 3 --obstacles 1":
@@ -165,6 +171,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     else:
         assert done.code == 0, done.err
         assert done.out or arguments[0] in ("bench", "tensorboard")
+        assert "already finished" not in done.err
     if "--json" in arguments:
         assert json.loads(done.out)
 

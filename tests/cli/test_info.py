@@ -51,6 +51,13 @@ def test_runs_are_counted_by_method_and_end(run: Run, found: dict[str, Any]) -> 
     assert counted["broken/runs"] == {"ours": {"damaged": 1}}
 
 
+def test_runs_are_those_of_the_folder_that_was_named(run: Run, found: dict[str, Any]) -> None:
+    assert list(json.loads(run("info", "--results", "broken", "--json").out)["runs"]) == ["broken/runs"]
+    done = run("info", "--results", "results/runs")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "error: results/runs/runs: no such folder; --results is the folder that holds runs/\n"
+
+
 def test_an_extra_is_installed_if_all_that_it_needs_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     needs = [
         "numpy>=2.0",

@@ -62,7 +62,9 @@ def wait_for(address: str, server: subprocess.Popen[str]) -> object:
 def test_no_runs_and_no_tensorboard_are_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = run("tensorboard", "--out", tmp_path / "empty")
     assert (done.code, done.out) == (2, "")
-    assert "no runs to show" in done.err
+    runs = tmp_path / "empty" / "runs"
+    advice = f"train one with --out {runs}, or give the folder that holds runs/ by --results"
+    assert done.err == f"error: {runs}: no runs to show; {advice}\n"
     monkeypatch.setattr(logger, "SummaryWriter", None)
     done = run("tensorboard", "--out", tmp_path)
     assert done.code == 2

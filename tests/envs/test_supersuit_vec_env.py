@@ -16,7 +16,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
 from supersuit import black_death_v3, concat_vec_envs_v1, pettingzoo_env_to_vec_env_v1
-from toy_envs import RecyclingEnv, StaggeredEnv, TallyEnv, UnequalEnv, VanishingEnv
+from toy_envs import RecyclingEnv, SpoiltEnv, StaggeredEnv, TallyEnv, UnequalEnv, VanishingEnv
 
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -174,6 +174,68 @@ def numbers_that_are_not_finite_are_named(make: Any) -> None:
 
 
 @law(bare_raises=NOT_RAISED)
+def rewards_that_are_not_finite_are_named(make: Any) -> None:
+    for number in (np.nan, np.float32("inf")):
+        venv = make(lambda number=number: SpoiltEnv("reward", number), 2)
+        venv.reset()
+        play(venv, 1)
+        with pytest.raises(RuntimeError, match=f"world 0, agent 'agent_1': reward is {number}; it must be finite"):
+            play(venv, 1)
+
+
+@law(bare_raises=NOT_RAISED)
+def observations_that_are_not_finite_are_named(make: Any) -> None:
+    told = np.array([1, -np.inf, np.nan], np.float32)
+    place = r"world 0, agent 'agent_1': {}observation\[1\] is -inf; it must be finite"
+    with pytest.raises(RuntimeError, match=place.format("")):
+        make(lambda: SpoiltEnv("observation", told, since=0), 2).reset()
+    for since, what in ((2, ""), (4, "last ")):  # an episode has four steps
+        venv = make(lambda since=since: SpoiltEnv("observation", told, since), 2)
+        venv.reset()
+        play(venv, since - 1)
+        with pytest.raises(RuntimeError, match=place.format(what)):
+            play(venv, 1)
+
+
+@law(bare_raises=NOT_RAISED)
+def a_missing_reward_is_named(make: Any) -> None:
+    venv = make(lambda: SpoiltEnv("reward", None), 2)
+    venv.reset()
+    with pytest.raises(RuntimeError, match=r"world 0: no reward of \['agent_1'\]; all must take part in every step"):
+        play(venv, 2)
+
+
+@law(bare_raises=ValueError)  # numpy's: "operands could not be broadcast together"
+def a_missing_flag_is_named(make: Any) -> None:
+    for flag in ("termination", "truncation"):
+        venv = make(lambda flag=flag: SpoiltEnv(flag, None), 2)
+        venv.reset()
+        with pytest.raises(RuntimeError, match=rf"world 0: no {flag} of \['agent_1'\]"):
+            play(venv, 2)
+
+
+@law(bare_raises=ValueError)  # numpy's, without a name; where all are so, the rewards become (6, 2)
+def a_reward_of_wrong_shape_is_named(make: Any) -> None:
+    for told in (np.zeros(2), [0.0, 0.0], np.zeros(1)):
+        venv = make(lambda told=told: SpoiltEnv("reward", told), 2)
+        venv.reset()
+        with pytest.raises(
+            RuntimeError, match=r"world 0, agent 'agent_1': reward has shape .*, expected a single number"
+        ):
+            play(venv, 2)
+
+
+@law(bare_raises=ValueError)  # numpy's "Output array is the wrong shape"
+def an_observation_of_wrong_shape_is_named(make: Any) -> None:
+    for told, shape in ((np.zeros(4, np.float32), r"\(4,\)"), ([0.0, 0.0], r"\(2,\)"), (0.0, r"\(\)")):
+        venv = make(lambda told=told: SpoiltEnv("observation", told), 2)
+        venv.reset()
+        reason = rf"world 0, agent 'agent_1': observation has shape {shape}, its space has \(3,\)"
+        with pytest.raises(RuntimeError, match=reason):
+            play(venv, 2)
+
+
+@law(bare_raises=NOT_RAISED)
 def surplus_actions_are_refused(make: Any) -> None:
     venv = make(TallyEnv, 2)
     venv.reset()
@@ -313,6 +375,14 @@ def test_actions_may_be_overwritten_between_the_halves_of_a_step() -> None:
     venv.step_async(actions)
     actions[:] = 9
     assert all((info["action"] == 1).all() for info in venv.step_wait()[3])
+
+
+def test_observations_may_be_lists_and_rewards_numbers_of_any_type() -> None:
+    for what, told in (("observation", [1.0, 2.0, 3.0]), ("reward", 7), ("reward", np.float32(7)), ("reward", True)):
+        venv = SuperSuitVecEnv(lambda what=what, told=told: SpoiltEnv(what, told), 2)
+        venv.reset()
+        observations, rewards, _, _ = play(venv, 2)
+        assert np.array_equal(observations[4] if what == "observation" else rewards[4], told)
 
 
 def test_missing_actions_are_named() -> None:

@@ -94,6 +94,29 @@ class VanishingEnv(TallyEnv):
         return observations
 
 
+class SpoiltEnv(TallyEnv):
+    """From step ``since`` on agent 1 is told something else as its ``what``; nothing where that is None."""
+
+    def __init__(self, what: str, told: Any, since: int = 2) -> None:
+        super().__init__()
+        self.what, self.told, self.since = what, told, since
+
+    def spoil(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+        if what == self.what and self.step_count >= self.since:
+            values["agent_1"] = self.told
+            if self.told is None:
+                del values["agent_1"]
+        return values
+
+    def observe(self) -> dict[str, Any]:
+        return self.spoil("observation", super().observe())
+
+    def step(self, actions: dict[str, NDArray[np.float32]]) -> Step:
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        rewards, terminations = self.spoil("reward", rewards), self.spoil("termination", terminations)
+        return observations, rewards, terminations, self.spoil("truncation", truncations), infos
+
+
 class RecyclingEnv(TallyEnv):
     """Writes every observation into the same arrays and every info into the same dicts, as fast simulators do."""
 

@@ -10,10 +10,10 @@ from tiny_runs import finished, tiny
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.encirclement_v0 import parallel_env
 from marl_encircle.experiments import evaluate
-from marl_encircle.experiments.build import load_policy
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import load_policy
 
 
 def play(config: Config, episodes: int, seed: int = 5) -> list[Episode]:

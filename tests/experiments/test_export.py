@@ -13,9 +13,9 @@ from tiny_runs import copy_of_finished, everything_in, finished
 
 from marl_encircle.core.observations import bounds
 from marl_encircle.experiments import export
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.choices import ExportFormat
 from marl_encircle.experiments.export import Array, ParityError, export_run
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import read_record
 from marl_encircle.experiments.yaml_files import ConfigError
 

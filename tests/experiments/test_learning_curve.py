@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import pytest
+from tiny_runs import tiny
 
 from marl_encircle import files
-from marl_encircle.experiments.learning_curve import curve_from_csv, read_curve
+from marl_encircle.experiments.learning_curve import count_points, curve_from_csv, read_curve
+from marl_encircle.experiments.train import train
 
 
 def test_a_curve_has_the_steps_and_shares_of_its_lines() -> None:
@@ -41,6 +43,25 @@ def test_a_learning_curve_that_cannot_be_is_refused(tmp_path: Path, text: str, r
     (tmp_path / "progress.csv").write_bytes(text.encode())
     with pytest.raises(files.DamagedFileError, match=rf"progress\.csv: no learning curve: .*{reason}"):
         read_curve(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("world_steps", "train_freq", "every", "points"),
+    [
+        (40, 1, 20, [20, 40]),
+        (44, 2, 12, [16, 24, 40, 48]),  # a rollout begins at 0, 8, ..., 40
+        (40, 5, 30, [40]),  # it begins at 0 and 20, the next one would at 40, where the training ends
+        (50, 5, 20, [20, 40, 60]),
+    ],
+)
+def test_the_points_of_a_training_are_as_many_as_were_counted(
+    tmp_path: Path, world_steps: int, train_freq: int, every: int, points: list[int]
+) -> None:
+    lengths = [f"training.world_steps={world_steps}", f"training.curve_every={every}"]
+    config = tiny(overrides=[*lengths, f"algorithm.train_freq={train_freq}", "algorithm.random_world_steps=8"])
+    folder, _ = train(config, 0, out=tmp_path)
+    assert read_curve(folder).world_steps.tolist() == points
+    assert count_points(config) == len(points)
 
 
 def test_a_curve_is_the_one_that_was_hashed(tmp_path: Path) -> None:

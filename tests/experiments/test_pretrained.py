@@ -11,8 +11,10 @@ from made_up import episode, write_run
 from tiny_runs import IN_SEVERAL_SETTINGS, finished, tiny
 
 from marl_encircle import MADDPG, files
-from marl_encircle.experiments import build, pretrained
-from marl_encircle.experiments.build import load_policy, make_vec_env, policy_bytes
+from marl_encircle.experiments import loading, pretrained
+from marl_encircle.experiments.build import make_vec_env, policy_bytes
+from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import load_policy, load_run
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run, first_run, pretrained_runs, setting_of
 from marl_encircle.experiments.records import Cell, Setting, read_record, run_path
 from marl_encircle.experiments.sizes import observation_size
@@ -86,7 +88,7 @@ def test_an_earlier_folder_is_preferred(tmp_path: Path) -> None:
 
 def test_a_policy_of_sets_stands_for_any_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, _ = train(tiny(overrides=IN_SEVERAL_SETTINGS), 3, out=tmp_path)
-    monkeypatch.setattr(build, "pretrained_runs", lambda: tmp_path)
+    monkeypatch.setattr(loading, "pretrained_runs", lambda: tmp_path)
     for fields in ({}, {"pursuers": 2, "obstacles": 0}, {"pursuers": 6, "obstacles": 4, "speed_ratio": 1.25}):
         assert find_run("ours", setting_of(fields), [tmp_path]) == folder
         policy = load_policy("ours", **fields)
@@ -160,10 +162,37 @@ def test_a_run_folder_has_its_own_setting_unless_its_policy_serves_any(tmp_path:
     assert load_policy(folder, pursuers=4).agents == replace(tiny().scenario, pursuers=4).agents
 
 
+@pytest.mark.parametrize(
+    "fields", [{"speed_ratio": 1.3}, {"scene": "tunnel"}, {"speed_ratio": 1.2, "scene": "concave", "obstacles": 1}]
+)
+def test_any_policy_of_a_folder_plays_at_other_speed_ratios_and_in_other_scenes(fields: dict[str, Any]) -> None:
+    own = load_run(finished())
+    setting = own.config.cell.setting._replace(**fields)
+    policy, config, _ = load_run(finished(), fields)
+    assert config.cell.setting == setting
+    assert policy_bytes(policy) == policy_bytes(load_policy(finished(), **fields)) == policy_bytes(own.policy)
+    assert play_rounds(policy, config, 10, 5) == play_rounds(own.policy, own.config, 10, 5, setting)
+
+
+def test_a_setting_that_there_is_not_is_refused_for_a_folder_too() -> None:
+    with pytest.raises(ConfigError, match=r"asked for .* at speed ratio 0\.5: scenario\.speed_ratio must be between"):
+        load_policy(finished(), speed_ratio=0.5)
+
+
 def test_a_zip_file_has_its_own_setting(tmp_path: Path) -> None:
     MADDPG("MlpPolicy", make_vec_env(n_worlds=2, seed=0)).save(tmp_path / "model.zip")
     with pytest.raises(ConfigError, match=r"model\.zip: a zip-file has a setting of its own; got pursuers"):
         load_policy(tmp_path / "model.zip", trusted=True, pursuers=3)
+
+
+def test_numpys_numbers_are_as_good_as_pythons(installed: Path) -> None:
+    numbers = {"pursuers": np.int64(3), "obstacles": np.uint8(1), "speed_ratio": np.float64(1.1)}
+    fields = {**numbers, "scene": np.str_("random")}
+    assert installed.is_dir()
+    assert policy_bytes(load_policy("ours", **fields)) == policy_bytes(load_policy("ours"))
+    assert {type(value) for value in setting_of(fields)} == {int, float, str}
+    with pytest.raises(ConfigError, match="pursuers: input should be a valid integer; got True"):
+        setting_of({"pursuers": np.bool_(True)})
 
 
 def test_a_setting_differs_from_the_usual_one_by_what_is_named() -> None:

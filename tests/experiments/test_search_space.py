@@ -144,6 +144,22 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "a seed twice": ({"seeds": "[950, 950]"}, "seed 950 stands there twice"),
     "no seeds": ({"seeds": "[]"}, "seeds: "),
     "too many points": ({"last_points": "5"}, "last_points: a learning curve has 4 points; got 5"),
+    "points that a training does not reach": (
+        {"overrides": str([*TINY, "algorithm.train_freq=25", "training.curve_every=130"]), "last_points": "4"},
+        "last_points: a learning curve has 3 points; got 4",  # at 200, 300 and, the end, 400
+    ),
+    "points that some trials do not reach": (
+        {
+            "overrides": str([*TINY, "training.curve_every=130"]),
+            "search": "{algorithm: {train_freq: {low: 1, high: 25}}}",
+            "last_points": "4",
+        },
+        "search.algorithm.train_freq: last_points: a learning curve has 3 points; got 4",
+    ),
+    "points between two trainings": (
+        {"search": "{algorithm: {train_freq: {low: 1, high: 31}}}"},
+        "search.algorithm.train_freq: training.curve_every: must be at least training.n_worlds * algorithm.train_freq",
+    ),
     "unknown rule": ({"pruning": "{rule: medean}"}, "pruning.rule: "),
     "no such method": ({"reward": "our"}, "reward 'our'"),
     "a wrong override": ({"overrides": "[algorithm.gamm=0.9]"}, "gamm"),

@@ -19,10 +19,11 @@ from marl_encircle import files
 from marl_encircle.core.rewards import TERMS
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import train
-from marl_encircle.experiments.build import load_policy
 from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.descriptions import METRICS, TRAINING, hyperparameters, texts
+from marl_encircle.experiments.learning_curve import count_points
+from marl_encircle.experiments.loading import load_policy
 from marl_encircle.experiments.tensorboard import EventFiles, Picture, gather, is_drawn
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.thumbnails import thumbnails
@@ -188,8 +189,15 @@ def test_pictures_are_few_evenly_spaced_and_the_last_is_among_them(
 ) -> None:
     lengths = [f"training.world_steps={world_steps}", f"training.curve_every={every}"]
     config = load_config(overrides=[*lengths, "training.curriculum=null"])
-    points = -(-world_steps // every)
+    points = count_points(config)
+    assert points == -(-world_steps // every)
     assert [point for point in range(1, points + 1) if is_drawn(config, point)] == drawn
+
+
+def test_the_last_point_is_drawn_where_one_less_is_reached() -> None:
+    lengths = ["training.world_steps=400", "algorithm.train_freq=25", "training.curve_every=130"]
+    config = tiny(overrides=lengths)  # points at 200, 300 and 400
+    assert [point for point in range(1, 4) if is_drawn(config, point)] == [3]
 
 
 # resumed

@@ -383,6 +383,18 @@ def test_logs_count_episodes_of_worlds_and_come_once_a_step(log_interval: int, l
     assert len(model.ep_info_buffer) == 6
 
 
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_logs_may_be_left_out_but_not_come_after_no_episode(cls: type[MADDPG]) -> None:
+    dumps = Dumps()
+    model = make_model(cls)
+    model.set_logger(Logger(None, [dumps]))
+    model.learn(120, log_interval=None)
+    assert not dumps.written
+    for log_interval in (0, -4):
+        with pytest.raises(ValueError, match=f"log_interval must be at least 1, or None .*, but got {log_interval}"):
+            model.learn(120, log_interval=log_interval)
+
+
 def test_vec_monitor_statistics_are_means_over_agents() -> None:
     dumps = Dumps()
     model = make_model(env=VecMonitor(LabelledWorlds()))
@@ -452,6 +464,27 @@ def test_a_pettingzoo_environment_and_the_bare_supersuit_wrapper_are_refused() -
     assert env.num_envs == 6
     with pytest.raises(ValueError, match=r"make_vec_env.*n_agents="):
         make_model(env=env)
+
+
+@pytest.mark.parametrize("env", ["marl_encircle/encirclement-v0", "marl_encircle/encirclement", "sisl/pursuit-v5"])
+def test_the_id_of_a_pettingzoo_environment_is_refused_with_the_call_that_builds_it(env: str) -> None:
+    with pytest.raises(ValueError, match=rf"make_vec_env.* SuperSuitVecEnv\(lambda: .*make\(\"parallel\", '{env}'\)"):
+        make_model(env=env)
+
+
+def test_an_id_that_nobody_knows_stays_gymnasiums() -> None:
+    with pytest.raises(gym.error.NameNotFound):
+        make_model(env="encirclement-v0")
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_discrete_actions_are_refused_with_the_argument_for_others(cls: type[MADDPG]) -> None:
+    env = LabelledWorlds()
+    env.action_space = spaces.Discrete(5)
+    with pytest.raises(AssertionError, match=r"deterministic, but got Discrete\(5\).* continuous_actions=True"):
+        make_model(cls, env)
+    with pytest.raises(AssertionError, match="Box action space"):
+        make_model(cls, "CartPole-v1")
 
 
 def test_a_number_of_agents_that_differs_from_the_environments_is_refused() -> None:
@@ -654,6 +687,15 @@ def test_sb3_action_noise_takes_the_place_of_the_default_noise() -> None:
     assert 0 < np.abs(spread).max() < 1e-2
 
 
+def test_action_noise_of_another_size_than_the_actions_is_refused() -> None:
+    noise = NormalActionNoise(np.zeros(3), np.full(3, 1e-3))
+    sizes = r"action_noise has shape \(12, 3\), but the actions of 12 slots \(12, 2\): .* must have shape \(2,\)"
+    with pytest.raises(ValueError, match=sizes):
+        make_model(action_noise=noise).learn(12)
+    with pytest.raises(ValueError, match=r"action_noise has shape \(3,\), .* 1 slots \(1, 2\)"):
+        make_model(env=LabelledWorlds(n_worlds=1, n_agents=1), action_noise=noise).learn(1)
+
+
 def test_sb3_action_noise_is_reset_where_an_episode_ends() -> None:
     class Noise(NormalActionNoise):
         def reset(self, *args: Any, **kwargs: Any) -> None:
@@ -705,6 +747,34 @@ def test_a_saved_model_acts_alike_and_learns_on_with_any_number_of_worlds(
     without_env = load(cls, tmp_path / "model.zip")
     obs = np.ones((6, 3), np.float32)
     np.testing.assert_array_equal(without_env.predict(obs)[0], model.predict(obs)[0])
+
+
+@pytest.mark.parametrize("critic", CRITICS)
+@pytest.mark.parametrize(("cls", "other"), [(MADDPG, MATD3), (MATD3, MADDPG)])
+def test_a_file_of_the_other_algorithm_is_refused_with_the_class_that_loads_it(
+    cls: type[MADDPG], other: type[MADDPG], critic: str, tmp_path: Path
+) -> None:
+    make_model(other, critic=critic).save(tmp_path / "model.zip")
+    name = other.__name__
+    with pytest.raises(ValueError, match=rf"model\.zip was saved by {name}, not by {cls.__name__}: use {name}\.load"):
+        load(cls, tmp_path / "model.zip")
+    with (tmp_path / "model.zip").open("rb") as file, pytest.raises(ValueError, match=f"saved by {name}"):
+        load(cls, file)  # type: ignore[arg-type]  # SB3 takes both
+
+
+def test_a_subclass_loads_what_its_parent_saved_and_other_faults_stay_pytorchs(tmp_path: Path) -> None:
+    class Own(MADDPG):
+        pass
+
+    class OtherPolicy(MADDPGPolicy):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **{**kwargs, "net_arch": [9]})
+
+    model = make_model()
+    model.save(tmp_path / "model.zip")
+    assert weights_hash(load(Own, tmp_path / "model.zip")) == weights_hash(model)
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        load(MADDPG, tmp_path / "model.zip", custom_objects={"policy_class": OtherPolicy})
 
 
 def test_action_noise_is_that_of_as_many_slots_as_there_are_after_loading(tmp_path: Path) -> None:

@@ -10,6 +10,9 @@ from faults import ERRNOS, fail_everywhere, largest_file, temporary_files
 from stable_baselines3 import DDPG
 from test_maddpg import load, make_model, weights_hash
 
+from marl_encircle.experiments.build import policy_bytes
+from marl_encircle.experiments.loading import load_policy
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, MATD3
 from marl_encircle.maddpg.saving import load_actors
 
@@ -48,6 +51,18 @@ def test_the_actors_of_a_saved_model_act_alone(tmp_path: Path) -> None:
     DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(tmp_path / "ddpg.zip")
     with pytest.raises(ValueError, match="not a model of MADDPG"):
         load_actors(tmp_path / "ddpg.zip")
+
+
+def test_a_trusted_model_is_loaded_by_the_name_it_was_saved_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = make_model()
+    for name in "md", "ours", "folder/md":  # there is a method "ours", too
+        model.save(name)
+        for saved in name, f"{name}.zip", Path(name):
+            assert policy_bytes(load_policy(saved, trusted=True)) == policy_bytes(model.policy)
+    assert policy_bytes(load_policy("ours")) != policy_bytes(model.policy)
+    with pytest.raises(ConfigError, match="'md': no method and no run folder"):
+        load_policy("md")
 
 
 def test_every_call_may_fail(tmp_path: Path) -> None:

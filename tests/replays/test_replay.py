@@ -8,10 +8,10 @@ from tiny_runs import finished, tiny
 
 from marl_encircle import files
 from marl_encircle.core.simulator import Simulator
-from marl_encircle.experiments.build import load_policy, load_run
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import Episode, episodes_from_csv
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import load_policy, load_run
 from marl_encircle.replays.replay import Replay, record_round
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"

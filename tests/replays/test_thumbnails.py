@@ -5,8 +5,8 @@ import io
 from PIL import Image
 from tiny_runs import finished, tiny
 
-from marl_encircle.experiments.build import load_policy
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.loading import load_policy
 from marl_encircle.replays.replay import record_first_rounds, record_round
 from marl_encircle.replays.thumbnails import FRAMES, _steps, thumbnails
 

@@ -30,7 +30,7 @@ from marl_encircle.experiments.train import train
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays import film, player
 from marl_encircle.replays.player import BAR, SPEEDS, Player, timeline
-from marl_encircle.replays.watch import Match, Side, _in_scene, end_of, find_match, find_side, fresh_seed
+from marl_encircle.replays.watch import Match, Side, end_of, find_match, find_side, fresh_seed
 
 RUNS = Path(__file__).parents[2] / "results" / "runs"
 OURS = Path(__file__).parents[2] / "ablations" / "ours.yaml"
@@ -153,15 +153,33 @@ def test_a_run_folder_of_another_setting_or_with_a_policy_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "scene", "said"),
+    ("fields", "said"),
     [
-        ({"composite_unit": False}, "tunnel", "scene tunnel: the policy of .* sees another number of obstacles"),
-        ({"obstacles": 2, "half_width": 0.4}, "tunnel", "scene tunnel: scenario: too many bodies to place"),
+        ({"composite_unit": False}, "policies of ours cannot play with other numbers of bodies"),
+        ({"obstacles": 2, "half_width": 0.4}, "scenario: too many bodies to place"),
     ],
 )
-def test_a_scene_that_a_policy_cannot_play_in_is_refused(fields: dict[str, Any], scene: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        _in_scene(tiny(**fields), scene, finished())
+def test_a_scene_that_a_policy_cannot_play_in_is_refused(tmp_path: Path, fields: dict[str, Any], said: str) -> None:
+    folder, _ = train(tiny(**fields), 0, out=tmp_path)
+    with pytest.raises(ConfigError, match=f"{folder} was trained .*; asked for .* in the scene tunnel: {said}"):
+        find_side(str(folder), scene="tunnel")
+
+
+def test_a_policy_of_sets_is_watched_where_an_obstacle_is_several(tmp_path: Path) -> None:
+    folder, _ = train(tiny(overrides=["algorithm.features=set"], composite_unit=False), 0, out=tmp_path)
+    [replay] = Match(find_side(str(folder), scene="tunnel"), eval_seed=5).replays(0)
+    assert (replay.scenario.units, len(replay.discs)) == (10, 10)
+
+
+def test_a_run_folder_is_watched_at_any_speed_ratio(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(REWARD)
+    faster = {"speed_ratio": 1.3}
+    for found in (
+        find_side(str(finished()), None, faster),
+        find_side(str(tmp_path / "mine.yaml"), None, faster, policy=finished()),
+    ):
+        [replay] = Match(found, eval_seed=5).replays(0)
+        assert (replay.scenario.speed_ratio, found.policy.agents) == (1.3, side().policy.agents)
 
 
 def test_rounds_are_fresh_unless_asked_for_and_it_is_said() -> None:

@@ -122,7 +122,7 @@ PROMISES = [
     ),
     Shown(
         "tests of archives that are read without being trusted, or in silence",
-        f"{EXPERIMENTS}test_build.py tests/maddpg/test_maddpg.py",
+        f"{EXPERIMENTS}test_loading.py tests/maddpg/test_maddpg.py",
         "trusted can_run_code",
     ),
     Shown(

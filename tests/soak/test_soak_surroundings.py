@@ -67,6 +67,7 @@ def test_the_core_needs_no_optional_part_and_the_others_name_theirs(folder: Path
     commands = [
         ["train", *tiny_arguments("--out", "runs", "--quiet", "--no-tensorboard")],
         ["evaluate", RUN],
+        ["train", "--profile", "smoke", "--seed", "900", "--out", "swept/runs", "--quiet", "--no-tensorboard"],
         ["tables", *SWEPT],
     ]
     failed, unhelpful = [], []

@@ -9,11 +9,11 @@ import pytest
 from tiny_runs import TINY, everything_in, train_in_this_process
 
 from marl_encircle.experiments import grid as grids
-from marl_encircle.experiments import trainable
+from marl_encircle.experiments import memory
 from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.memory import memory_needed
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.sweep import Progress
-from marl_encircle.experiments.trainable import memory_needed
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study import calibrate as calibration
 from marl_encircle.study.calibrate import Trial, calibrate, render
@@ -127,7 +127,7 @@ def test_a_neighbour_that_does_not_fit_into_memory_is_refused_before_the_centre_
     protocol = load_protocol(str(tmp_path / "protocol.yaml"))
     centre = sum(memory_needed(load_config("ours", profile="smoke", fields={"obstacles": 0})).values())
     (tmp_path / "memory.max").write_text(str(centre))
-    monkeypatch.setattr(trainable, "CONTAINER_LIMIT", tmp_path / "memory.max")
+    monkeypatch.setattr(memory, "CONTAINER_LIMIT", tmp_path / "memory.max")
     with pytest.raises(ConfigError, match="GB of memory"):
         calibrate(protocol, tmp_path / "out", 1)
     assert asked == []

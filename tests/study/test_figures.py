@@ -25,10 +25,10 @@ from tiny_runs import TINY, finished
 from marl_encircle import files
 from marl_encircle.drawing.palette import PURSUERS, SERIES
 from marl_encircle.experiments import grid as grids
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.learning_curve import curve_from_csv
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import share_interval, summarise_cell
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.train import OtherRunError, run_folder, train

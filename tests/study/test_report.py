@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,10 +19,11 @@ from tiny_runs import TINY, command, everything_in, finished, tiny
 
 from marl_encircle.core.geometry import NOBODY
 from marl_encircle.experiments import grid as grids
-from marl_encircle.experiments.build import build_policy, load_policy
+from marl_encircle.experiments.build import build_policy
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.learning_curve import curve_from_csv
+from marl_encircle.experiments.loading import load_policy
 from marl_encircle.experiments.records import Cell, Run, Setting, read_runs
 from marl_encircle.experiments.train import train
 from marl_encircle.replays.replay import Replay, record_round
@@ -324,8 +326,45 @@ def test_curves_are_drawn_where_the_numbers_are() -> None:
 
 
 @pytest.mark.usefixtures("_tiny_grid")
-def test_the_command_prints_the_file(
+def test_the_command_says_what_takes_its_time_and_prints_the_file(
     runs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = command(capsys, monkeypatch, "report", "--grid", "smoke", "--out", runs)
     assert (done.code, done.out) == (0, f"{runs / 'report.html'}\n")
+    assert done.err == "playing the first rounds of every cell again, about a second each\n"
+
+
+def test_without_a_grid_and_runs_of_the_usual_one_all_runs_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(tiny(), 7, "native", tmp_path / "runs")
+    train(tiny(obstacles=2), 8, "native", tmp_path / "runs")
+    done = command(capsys, monkeypatch, "report", "--results", tmp_path)
+    assert (done.code, done.out) == (0, f"{tmp_path / 'report.html'}\n")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "2 of 2 finished" in Parsed(page).words
+    assert [(cell["seed"], len(cell["rounds"])) for cell in data_in(page)["cells"]] == [(7, ROUNDS), (8, ROUNDS)]
+
+    other = train(tiny(overrides=["algorithm.gamma=0.8"]), 9, "native", tmp_path / "runs")[0]
+    done = command(capsys, monkeypatch, "report", "--results", tmp_path)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.splitlines()[-1] == (
+        f"error: {other} and {other.with_name('seed7')} are of one cell and were not trained alike "
+        "(algorithm.gamma: 0.8 here, 0.9 there): write a grid of those that are meant and give it by --grid"
+    )
+
+
+@pytest.mark.usefixtures("_tiny_grid")
+def test_runs_that_the_usual_grid_leaves_out_are_told(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = load_grid("smoke")
+    monkeypatch.setattr(grids, "load_grid", lambda _: usual)
+    shutil.copytree(runs / "runs", tmp_path / "runs")
+    assert "left out" not in command(capsys, monkeypatch, "report", "--results", tmp_path).err
+    train(tiny(), 7, "native", tmp_path / "runs")
+    for arguments, told in (((), True), (("--grid", "committed"), False)):
+        done = command(capsys, monkeypatch, "report", "--results", tmp_path, *arguments)
+        said = "left out: 1 run that the grid committed does not ask for, such as ours/ratio1.1_n3_m1_random/seed7\n"
+        assert (done.code, said in done.err) == (0, told)
+    assert "1 of 2 finished" in Parsed((tmp_path / "report.html").read_text(encoding="utf-8")).words

@@ -7,11 +7,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from marl_encircle import files
-from marl_encircle.experiments.build import load_run
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.learning_curve import Curve, read_curve
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
 from marl_encircle.experiments.records import CURVE, Cell, Run, read_record, run_path
 from marl_encircle.replays.replay import record_round

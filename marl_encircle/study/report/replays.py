@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from marl_encircle.core.geometry import NOBODY
 from marl_encircle.drawing.outlines import facing_arc, polar
 from marl_encircle.drawing.palette import PURSUERS
-from marl_encircle.experiments.build import load_run
+from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import Cell, Run, Setting, run_path
 from marl_encircle.replays.replay import Replay, record_round
 from marl_encircle.study.cells import gather, result_of
