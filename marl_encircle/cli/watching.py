@@ -46,7 +46,7 @@ def watch(
         ),
     ] = None,
     speed_ratio: Annotated[
-        float | None, setting_option("LAMBDA", "Target speed / pursuer speed of the run.", "1.1")
+        float | None, setting_option("LAMBDA", "Target speed / pursuer speed.", "1.1")
     ] = None,
     pursuers: Annotated[int | None, setting_option("N", "Number of pursuers of the run.", "3")] = None,
     obstacles: Annotated[int | None, setting_option("M", "Number of obstacles of the run.", "1")] = None,
