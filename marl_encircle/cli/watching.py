@@ -45,9 +45,7 @@ def watch(
             "--results", metavar="DIR", help="Folder of runs/.", show_default="results, then the package's own"
         ),
     ] = None,
-    speed_ratio: Annotated[
-        float | None, setting_option("LAMBDA", "Target speed / pursuer speed.", "1.1")
-    ] = None,
+    speed_ratio: Annotated[float | None, setting_option("LAMBDA", "Target speed / pursuer speed.", "1.1")] = None,
     pursuers: Annotated[int | None, setting_option("N", "Number of pursuers of the run.", "3")] = None,
     obstacles: Annotated[int | None, setting_option("M", "Number of obstacles of the run.", "1")] = None,
     scene: Annotated[
