@@ -224,7 +224,7 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        self._check_step(observations, rewards, terminations, truncations)
+        self._check_told(observation=observations, reward=rewards, termination=terminations, truncation=truncations)
         # MarkovVectorEnv plays on until all have ended, without a terminal_observation for those who ended before.
         ended = [agent for agent in self.possible_agents if terminations[agent] or truncations[agent]]
         if 0 < len(ended) < len(self.possible_agents):
@@ -239,25 +239,8 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         }
         return observations, rewards, terminations, truncations, infos
 
-    def _check_step(self, observations: Any, rewards: Any, terminations: Any, truncations: Any) -> None:
-        """Refuse what MarkovVectorEnv cannot stack, or makes something else of: a missing reward is 0 to it."""
-        shape = self.shapes["observation"]
-        for agent in self.possible_agents:
-            # What is usual passes at once: _check_told for all would take 4 % of a step.
-            if (
-                agent not in observations
-                or agent not in rewards
-                or agent not in terminations
-                or agent not in truncations
-                or getattr(observations[agent], "shape", None) != shape
-                or not isinstance(rewards[agent], float)
-            ):
-                self._check_told(
-                    observation=observations, reward=rewards, termination=terminations, truncation=truncations
-                )
-                return
-
     def _check_told(self, **told: dict[str, Any]) -> None:
+        """Refuse what MarkovVectorEnv cannot stack, or makes something else of: a missing reward is 0 to it."""
         for what, values in told.items():
             if absent := [agent for agent in self.possible_agents if agent not in values]:
                 raise RuntimeError(f"world {self.index}: no {what} of {absent}; all must take part in every step")

@@ -504,13 +504,15 @@ class MADDPG(OffPolicyAlgorithm):
         :raises ValueError: if it was made for other slots, agents or returns; the former buffer stays
         """
         former = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, former
-        for name, wanted in {"n_envs": self.n_envs, "n_agents": self.n_agents, "n_steps": self.n_steps}.items():
-            if getattr(loaded, name, None) != wanted:
-                saved = getattr(loaded, name, "none")
-                raise ValueError(f"{path} is no replay buffer of this model: its {name} is {saved}, not {wanted}")
-        self.replay_buffer = loaded
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            for name, wanted in {"n_envs": self.n_envs, "n_agents": self.n_agents, "n_steps": self.n_steps}.items():
+                saved = getattr(self.replay_buffer, name, "none")
+                if saved != wanted:
+                    raise ValueError(f"{path} is no replay buffer of this model: its {name} is {saved}, not {wanted}")
+        except (ValueError, AssertionError):  # SB3 asserts that it is a replay buffer, once it has taken its place
+            self.replay_buffer = former
+            raise
 
     @classmethod
     def load(

@@ -1,5 +1,6 @@
 import hashlib
 import inspect
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any, ClassVar
@@ -832,6 +833,15 @@ def test_a_replay_buffer_of_another_model_is_refused_and_the_own_one_stays(
     model = make_model(n_steps=3)
     own = model.replay_buffer
     with pytest.raises(ValueError, match=rf"buffer\.pkl is no replay buffer of this model: its {difference}"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer is own
+
+
+def test_the_own_replay_buffer_stays_where_a_file_holds_none(tmp_path: Path) -> None:
+    (tmp_path / "buffer.pkl").write_bytes(pickle.dumps({"no": "buffer"}))
+    model = make_model()
+    own = model.replay_buffer
+    with pytest.raises(AssertionError, match="must inherit from ReplayBuffer"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is own
 
