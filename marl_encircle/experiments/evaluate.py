@@ -9,7 +9,7 @@ from marl_encircle.core.rewards import Reward
 from marl_encircle.core.rounds import NEVER
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.build import fit_policy
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import Episode
@@ -52,8 +52,8 @@ def _play(
     arena.simulator.seed(seeds)
     observations = arena.reset()
     for _ in range(scenario.max_cycles):
-        slots, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
-        observations = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE)).observations
+        actions, _ = policy.predict(observations, deterministic=True)
+        observations = arena.step(np.asarray(actions)).observations
     rounds = arena.rounds
     steps = np.stack(list(rounds.success_step.values()))
     length = np.where((steps != NEVER).all(axis=0), steps.max(axis=0), scenario.max_cycles)

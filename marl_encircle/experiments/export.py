@@ -146,20 +146,16 @@ def played_observations(policy: MADDPGPolicy, config: Config) -> Array:
     arena.simulator.seed(world_seeds(config.evaluation.curve_seed, PLAYED))
     seen = [arena.reset()]
     while len(seen) < config.scenario.max_cycles:
-        seen.append(arena.step(predict(policy, seen[-1])).observations)
+        actions, _ = policy.predict(seen[-1], deterministic=True)
+        seen.append(arena.step(np.asarray(actions)).observations)
     return np.concatenate(seen)
 
 
-def predict(policy: MADDPGPolicy, observations: Array) -> Array:
-    """Return the policy's own actions, (B, N, U)."""
-    actions, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
-    return np.asarray(actions).reshape(*observations.shape[:2], -1)
-
-
 def difference(policy: MADDPGPolicy, act: Act, observations: Array) -> float:
-    """Return the largest difference from ``predict`` in any action, for a world alone and for many."""
+    """Return the largest difference from the policy's own in any action, for a world alone and for many."""
+    expected, _ = policy.predict(observations, deterministic=True)
     actions = np.concatenate([act(observations[:1]), act(observations[1:])])
-    return float(np.abs(actions - predict(policy, observations)).max())
+    return float(np.abs(actions - expected).max())
 
 
 def _to_onnx(actors: Actors, observations: th.Tensor, description: dict[str, Any]) -> bytes:

@@ -1,9 +1,5 @@
 """Multi-Agent Deep Deterministic Policy Gradient."""
 
-import io
-import pathlib
-import warnings
-from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,7 +8,6 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
     GymEnv,
@@ -33,12 +28,12 @@ from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.gradients import actor_gradients, critic_gradients, is_plain
 from marl_encircle.maddpg.models import Actor, CentralCritic, CriticKind
 from marl_encircle.maddpg.policies import CnnPolicy, MADDPGPolicy, MlpPolicy
-from marl_encircle.maddpg.saving import UntrustedFileWarning, saved_critics, whole_file
+from marl_encircle.maddpg.saving import SavedOffPolicyAlgorithm
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 
 
-class MADDPG(OffPolicyAlgorithm):
+class MADDPG(SavedOffPolicyAlgorithm):
     """Multi-Agent Deep Deterministic Policy Gradient (MADDPG).
 
     Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017). Equation numbers in this file are those of
@@ -79,13 +74,11 @@ class MADDPG(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
-    n_critics: ClassVar[int] = 1
     policy: MADDPGPolicy
     actor: Actor
     actor_target: Actor
     critic: CentralCritic
     critic_target: CentralCritic
-    replay_buffer: JointReplayBuffer | None
     exploration_rng: np.random.Generator
 
     def __init__(
@@ -468,92 +461,6 @@ class MADDPG(OffPolicyAlgorithm):
                 self.ep_info_buffer.append({key: np.mean([episode[key] for episode in episodes]) for key in "rlt"})
             if successes:
                 self.ep_success_buffer.append(np.mean(successes))
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """Save the model to a zip-file as SB3 does, whole or not at all: a former file stays until the new one is.
-
-        :param path: the file, with the suffix ``.zip`` if it has none
-        :param exclude: attributes to leave out
-        :param include: attributes to save although SB3 leaves them out
-        :raises OSError: with the file's name; the former file is unchanged
-        """
-        with whole_file(path, ".zip") as target:
-            super().save(target, exclude, include)
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Save the replay buffer to a pickle file as SB3 does, whole or not at all.
-
-        :param path: the file, with the suffix ``.pkl`` if it has none
-        :raises OSError: with the file's name; the former file is unchanged
-        """
-        with whole_file(path, ".pkl") as target:
-            super().save_replay_buffer(target)
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """Load a replay buffer from a pickle file as SB3 does.
-
-        **Such a file can run code when it is loaded: load only files that you trust.**
-
-        :param path: the file
-        :param truncate_last_traj: unused, SB3's interface
-        :raises ValueError: if it was made for other slots, agents or returns; the former buffer stays
-        """
-        former = self.replay_buffer
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-            for name, wanted in {"n_envs": self.n_envs, "n_agents": self.n_agents, "n_steps": self.n_steps}.items():
-                saved = getattr(self.replay_buffer, name, "none")
-                if saved != wanted:
-                    raise ValueError(f"{path} is no replay buffer of this model: its {name} is {saved}, not {wanted}")
-        except (ValueError, AssertionError):  # SB3 asserts that it is a replay buffer, once it has taken its place
-            self.replay_buffer = former
-            raise
-
-    @classmethod
-    def load(
-        cls: type[SelfMADDPG],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfMADDPG:
-        """Load a model from a zip-file of ``save``, for any number of worlds.
-
-        **Such a file can run code when it is loaded: load only files that you trust.** An ``UntrustedFileWarning``
-        says so every time; filter it where you know where your files come from.
-
-        :param path: the file
-        :param env: the environment to go on with; it must have the number of agents that was saved
-        :param device: where to put the networks
-        :param custom_objects: objects to use in place of saved ones
-        :param print_system_info: whether to print the versions saved and in use
-        :param force_reset: whether ``env`` is reset before training
-        :param kwargs: attributes to change
-        :raises ValueError: where the number of agents differs, or another algorithm saved it
-        """
-        warnings.warn(
-            f"{path} is a zip-file of pickled objects, which can run code when it is loaded: load only what you trust.",
-            UntrustedFileWarning,
-            stacklevel=2,
-        )
-        try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except RuntimeError as error:  # PyTorch's, with the names of the weights that one has and the other has not
-            n_critics = saved_critics(path)
-            algorithms: list[type[MADDPG]] = [MADDPG, *MADDPG.__subclasses__()]
-            others = [other for other in algorithms if other.n_critics == n_critics]
-            if n_critics == cls.n_critics or not others:
-                raise
-            name = others[0].__name__
-            raise ValueError(f"{path} was saved by {name}, not by {cls.__name__}: use {name}.load") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target"]

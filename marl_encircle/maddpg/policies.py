@@ -188,8 +188,8 @@ class MADDPGPolicy(BasePolicy):
     ) -> tuple[np.ndarray | dict[str, np.ndarray], tuple[np.ndarray, ...] | None]:
         """Actions for the agents of one or more worlds.
 
-        :param observation: world-major slots, shape (B * N, *O), one world, (N, *O), or a dict of the agents'
-            observations, each (*O): by name where the policy knows the ``agents``, else in the order of the
+        :param observation: worlds, shape (B, N, *O), their slots, (B * N, *O), one world, (N, *O), or a dict of the
+            agents' observations, each (*O): by name where the policy knows the ``agents``, else in the order of the
             environment's ``possible_agents``
         :param state: unused, SB3's interface
         :param episode_start: unused, SB3's interface
@@ -198,7 +198,14 @@ class MADDPGPolicy(BasePolicy):
         :raises ValueError: where observations of some agents are missing
         """
         if not isinstance(observation, Mapping):
-            return super().predict(observation, state, episode_start, deterministic)
+            shape = np.shape(observation)
+            if shape[2:] != self.observation_space.shape:  # slots
+                return super().predict(observation, state, episode_start, deterministic)
+            if shape[1] != self.n_agents:
+                raise ValueError(f"predict needs the observations of all {self.n_agents} agents, but got {shape[1]}")
+            slots = np.concatenate(observation)
+            actions, state = super().predict(slots, state, episode_start, deterministic)
+            return actions.reshape(*shape[:2], *actions.shape[1:]), state
         agents = self.agents or tuple(observation)
         if len(agents) != self.n_agents or set(agents) != set(observation):
             wanted = ", ".join(map(str, self.agents)) if self.agents else f"all {self.n_agents} agents"

@@ -11,7 +11,7 @@ from marl_encircle.core.geometry import Closure, Enclosure
 from marl_encircle.core.rounds import NEVER
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator, world_seeds
-from marl_encircle.envs.arena import ACTION_SIZE, Arena
+from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.evaluate import WORLDS_AT_ONCE
 from marl_encircle.experiments.memory import available_memory, check_memory
@@ -170,8 +170,8 @@ def _record(
     rewards: dict[int, list[Array]] = {world: [] for world in worlds}
     playing = worlds
     for _ in range(scenario.max_cycles):
-        slots, _ = policy.predict(observations.reshape(-1, observations.shape[-1]), deterministic=True)
-        outcome = arena.step(np.asarray(slots).reshape(len(seeds), -1, ACTION_SIZE))
+        actions, _ = policy.predict(observations, deterministic=True)
+        outcome = arena.step(np.asarray(actions))
         observations = outcome.observations
         for world in playing:
             rewards[world].append(outcome.rewards[world].astype(np.float64))

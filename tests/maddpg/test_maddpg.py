@@ -549,12 +549,13 @@ def test_training_by_episodes_needs_one_world() -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def test_predict_takes_slots_one_world_or_a_dict_by_agent() -> None:
+def test_predict_takes_worlds_their_slots_one_world_or_a_dict_by_agent() -> None:
     model = make_model()
     obs = np.random.default_rng(0).standard_normal((6, 3)).astype(np.float32)
     actions, state = model.predict(obs)
     assert actions.shape == (6, 2)
     assert state is None
+    np.testing.assert_array_equal(model.predict(obs.reshape(2, 3, 3))[0], actions.reshape(2, 3, 2))
     np.testing.assert_allclose(model.predict(obs[3:])[0], actions[3:], rtol=1e-5, atol=1e-6)
     by_name, _ = model.predict({f"agent_{i}": obs[3 + i] for i in range(3)})
     assert list(by_name) == ["agent_0", "agent_1", "agent_2"]
@@ -609,8 +610,14 @@ def test_what_does_not_name_each_agent_of_a_world_is_no_names(agents: Any) -> No
 
 @pytest.mark.parametrize(
     "observation",
-    [np.zeros(3), np.zeros((4, 3)), {"agent_0": np.zeros(3)}, {f"agent_{i}": np.zeros(3) for i in range(6)}],
-    ids=["one row", "four rows", "one agent", "six agents"],
+    [
+        np.zeros(3),
+        np.zeros((4, 3)),
+        np.zeros((2, 4, 3)),
+        {"agent_0": np.zeros(3)},
+        {f"agent_{i}": np.zeros(3) for i in range(6)},
+    ],
+    ids=["one row", "four rows", "four agents", "one agent", "six agents"],
 )
 def test_predict_refuses_observations_of_some_agents(observation: Any) -> None:
     with pytest.raises(ValueError, match="observations of all 3 agents"):
