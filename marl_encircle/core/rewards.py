@@ -175,6 +175,7 @@ class Reward:
             object.__setattr__(self, f.name, plain(getattr(self, f.name)))
         if self.closure not in get_args(Closure):
             raise ValueError(f"closure must be one of {', '.join(get_args(Closure))}; got {self.closure!r:.80}")
+        _check_finite("scale", self.scale)
         if not isinstance(self.terms, Mapping):
             raise ValueError(f"terms must be a mapping of terms to their weights; got {self.terms!r:.80}")
         terms: dict[str, Any] = {}
@@ -222,9 +223,12 @@ def _check(name: str, term: Any) -> None:
     for key, value in settings.items():
         if key not in known:
             raise ValueError(f"terms.{name}.{key:.80}: unknown parameter{nearest(key, known)}")
-        if key == "weight" and value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
-            raise ValueError(f"terms.{name}.{key} must be a finite number; got {value!r:.80}")
+        if key != "weight" or value is not None:
+            _check_finite(f"terms.{name}.{key}", value)
     if "weight" not in settings:
         raise ValueError(f"terms.{name} needs a weight")
+
+
+def _check_finite(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
+        raise ValueError(f"{name} must be a finite number; got {value!r:.80}")

@@ -275,6 +275,7 @@ WRONG: dict[str, tuple[Callable[[], Reward], str]] = {
     "text": (lambda: Reward({"time": "8"}), r"terms\.time\.weight must be a finite number; got '8'"),  # type: ignore[dict-item]
     "yes": (lambda: Reward({"time": True}), r"terms\.time\.weight must be a finite number; got True"),
     "too large": (lambda: Reward({"time": 10**400}), r"terms\.time\.weight must be a finite number; got 1000"),
+    "scale": (lambda: Reward(scale=math.nan), r"^scale must be a finite number; got nan"),
     "nan": (lambda: Reward({"time": math.nan}), r"terms\.time\.weight must be a finite number; got nan"),
     "null parameter": (
         lambda: Reward({"contraction": {"weight": 1, "cap": None}}),  # type: ignore[dict-item]
