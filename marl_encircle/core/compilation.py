@@ -18,7 +18,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def source_hash() -> str:
+def core_hash() -> str:
     """Return the hash of the core's source files, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -31,7 +31,7 @@ def cache_folder() -> Path:
 
     ``MARL_ENCIRCLE_CACHE``, else ``XDG_CACHE_HOME``, else ``~/.cache``; else a new temporary folder.
     """
-    name = f"numba-{source_hash()}"
+    name = f"numba-{core_hash()}"
     for root in (os.environ.get("MARL_ENCIRCLE_CACHE"), os.environ.get("XDG_CACHE_HOME"), "~/.cache"):
         if not root:
             continue

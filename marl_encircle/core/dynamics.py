@@ -43,8 +43,6 @@ def physics_of(scenario: "Scenario") -> Constants:
         "wall_weight": scenario.wall_weight,
         "obstacle_margin": scenario.obstacle_margin,
         "movement_range_limit": scenario.movement_range_limit,
-        "stage_threshold": scenario.stage_threshold,
-        "direction_softening": scenario.direction_softening,
         "path_samples": scenario.path_samples,
         "units": scenario.units,
         "first_order": scenario.dynamics == "first_order",

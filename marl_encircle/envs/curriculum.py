@@ -7,8 +7,8 @@ import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn, VecEnvWrapper
 
 
-class Level(NamedTuple):
-    """One field's way from easy to final, in a straight line over ``world_steps``."""
+class Ramp(NamedTuple):
+    """A straight line from ``start`` to ``end`` over ``world_steps``, then ``end``."""
 
     start: float
     end: float
@@ -23,19 +23,19 @@ class CurriculumVecEnv(VecEnvWrapper):
     """Set the difficulty of ``venv``'s worlds before every step; it acts at each world's next round.
 
     :param venv: slots of worlds whose environments have ``set_difficulty``
-    :param levels: by the name of a scenario field: ``safety_distance``, ``obstacle_radius`` or ``speed_ratio``
+    :param ramps: by the name of a scenario field: ``safety_distance``, ``obstacle_radius`` or ``speed_ratio``
     """
 
-    def __init__(self, venv: VecEnv, levels: Mapping[str, Level]) -> None:
+    def __init__(self, venv: VecEnv, ramps: Mapping[str, Ramp]) -> None:
         super().__init__(venv)
-        self.levels = dict(levels)
+        self.ramps = dict(ramps)
         self.world_steps = 0
         self._last: dict[str, float] = {}
 
     @property
     def difficulty(self) -> dict[str, float]:
         """The present value of every field of the curriculum."""
-        return {name: level.at(self.world_steps) for name, level in self.levels.items()}
+        return {name: ramp.at(self.world_steps) for name, ramp in self.ramps.items()}
 
     def reset(self) -> VecEnvObs:
         """Start new rounds at the present difficulty."""

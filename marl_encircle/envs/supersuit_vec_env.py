@@ -208,15 +208,17 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         self.shapes = {"observation": world.observation_space(world.possible_agents[0]).shape, "reward": ()}
         self.index = index
         self.reset_infos: list[dict[str, Any]] = []
-        if not hasattr(world.unwrapped, "render_mode"):  # MarkovVectorEnv reads it, PettingZoo does not ask for it
-            world.unwrapped.render_mode = None  # type: ignore[attr-defined]  # new on that class
+        read_by_supersuit: dict[str, Any] = {"render_mode": None, "metadata": {}}
+        for name, usual in read_by_supersuit.items():
+            if not hasattr(world.unwrapped, name):
+                setattr(world.unwrapped, name, usual)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         observations, infos = self.env.reset(seed=seed, options=options)
         self._check_told(observation=observations)
-        self.reset_infos = [dict(infos.get(agent, {})) for agent in self.possible_agents]
+        self.reset_infos = [dict((infos or {}).get(agent) or {}) for agent in self.possible_agents]
         # MarkovVectorEnv lays the infos of an automatic reset over those of the last step: leave it none.
         return observations, {}
 
@@ -234,7 +236,10 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
             observations = deepcopy(observations)
         # MarkovVectorEnv writes into the world's own infos: give it copies. SB3VecEnvWrapper drops the truncations.
         infos = {
-            agent: {**infos.get(agent, {}), "TimeLimit.truncated": bool(truncations[agent] and not terminations[agent])}
+            agent: {
+                **((infos or {}).get(agent) or {}),
+                "TimeLimit.truncated": bool(truncations[agent] and not terminations[agent]),
+            }
             for agent in self.possible_agents
         }
         return observations, rewards, terminations, truncations, infos

@@ -13,14 +13,15 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.envs import encirclement_v0
 from marl_encircle.envs.arena import spaces_of
-from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
+from marl_encircle.envs.curriculum import CurriculumVecEnv, Ramp
 from marl_encircle.envs.mixed_vec_env import MixedVecEnv
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
 from marl_encircle.experiments.choices import Engine, Profile
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.features import RelativeFeatures, SetFeatures
-from marl_encircle.experiments.sections import AlgorithmConfig, Schedule
+from marl_encircle.experiments.sections import AlgorithmConfig, ScheduleConfig
+from marl_encircle.experiments.sizes import buffer_world_steps
 from marl_encircle.experiments.trainable import check_curriculum
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG
@@ -88,12 +89,12 @@ def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, c
         worlds = EncirclementVecEnv(scenario, reward, n_worlds)
     else:
         worlds = SuperSuitVecEnv(lambda: encirclement_v0.parallel_env(scenario, reward), n_worlds)
-    levels: dict[str, Level] = {
-        name: Level(ramp.start, getattr(scenario, name), ramp.world_steps)
+    ramps: dict[str, Ramp] = {
+        name: Ramp(ramp.start, getattr(scenario, name), ramp.world_steps)
         for name, ramp in config.training.curriculum.items()
         if ramp is not None and curriculum
     }
-    return VecMonitor(CurriculumVecEnv(worlds, levels))
+    return VecMonitor(CurriculumVecEnv(worlds, ramps))
 
 
 def check_engine(engine: str, config: Config) -> None:
@@ -118,13 +119,11 @@ def build_model(config: Config, env: VecEnv, seed: int, **kwargs: Any) -> MADDPG
     """
     a, n = config.algorithm, config.scenario.pursuers
     end = a.learning_rate_end
-    # A buffer larger than the training would only cost memory.
-    buffer_world_steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
     return ALGORITHMS[a.name](
         "MlpPolicy",
         env,
         learning_rate=a.learning_rate if end is None else LinearSchedule(a.learning_rate, end, 1.0),
-        buffer_size=buffer_world_steps * n,
+        buffer_size=buffer_world_steps(a, config.training) * n,
         learning_starts=a.random_world_steps * n,
         batch_size=a.batch_size,
         tau=a.tau,
@@ -162,13 +161,13 @@ class NoiseSchedule:
     :param world_steps: of the whole training
     """
 
-    def __init__(self, schedule: Schedule, world_steps: int) -> None:
-        self.level = Level(schedule.start, schedule.end, schedule.world_steps)
+    def __init__(self, schedule: ScheduleConfig, world_steps: int) -> None:
+        self.ramp = Ramp(schedule.start, schedule.end, schedule.world_steps)
         self.world_steps = world_steps
 
     def __call__(self, progress_remaining: float) -> float:
         """Return the standard deviation of the exploration noise."""
-        return self.level.at(round((1.0 - progress_remaining) * self.world_steps))
+        return self.ramp.at(round((1.0 - progress_remaining) * self.world_steps))
 
 
 def build_policy(config: Config) -> MADDPGPolicy:

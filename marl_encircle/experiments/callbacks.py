@@ -148,8 +148,10 @@ class LearningCurve(BaseCallback):
         e = self.config.evaluation
         settings = self.config.settings
         n_rounds = -(-e.curve_episodes // len(settings))
-        played = (play_rounds(self.model.policy, self.config, n_rounds, e.curve_seed, each) for each in settings)
-        episodes = [episode._replace(round=i) for i, episode in enumerate(chain.from_iterable(played))]
+        policy = self.model.policy
+        played = {each: play_rounds(policy, self.config, n_rounds, e.curve_seed, each) for each in set(settings)}
+        every = chain.from_iterable(played[each] for each in settings)  # those with more worlds count for more
+        episodes = [episode._replace(round=i) for i, episode in enumerate(every)]
         own = summarise_run(episodes, self.config.reward.closure)
         rates = [summarise_run(episodes, rule).success for rule in ("all", "pursuers")]
         row = [self.curriculum.world_steps, own.success, own.mean_episode_length, *rates, own.sigma_c]

@@ -254,7 +254,7 @@ def _check_algorithm(name: str) -> None:
 
 
 def _check_settings(config: Config) -> None:
-    """Refuse settings that the networks cannot read, or that one more pursuer than the scenario has would be in."""
+    """Refuse settings that one network cannot read, that the scenario has no room for, or no equal share of worlds."""
     where, settings = "training.settings", config.training.settings
     if not settings:
         return

@@ -25,7 +25,7 @@ def play_rounds(
 ) -> list[Episode]:
     """Play each round once, in a world of its own, with noise off and the scenario at its final difficulty.
 
-    Round r of evaluation seed s starts from the same placement for every method. It is played until both closure rules
+    Round r of evaluation seed s starts from the same placement for every method. It counts until both closure rules
     have held or time is up, so that it does not matter which of them ends the method's training rounds.
 
     :param episodes: number of rounds

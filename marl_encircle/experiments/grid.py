@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
@@ -129,7 +130,7 @@ class Grid(NamedTuple):
 def load_grid(name: str) -> Grid:
     """Return the runs of a grid, each once, none of a cell that shares another's.
 
-    The first seed of all cells comes first, else the file's order: a sweep that is stopped leaves every cell alike.
+    They come in the order of the seeds, else in the file's: a sweep that is stopped leaves every cell alike.
 
     :param name: a name in ``configs/paper/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
@@ -137,46 +138,50 @@ def load_grid(name: str) -> Grid:
     read_anew()
     path = find_file(name, "grid")
     values = read_yaml(path)
-    with naming_file(path):
-        grid = section_of(GridConfig, values)
-
-    def beside(name: str) -> str:
-        return str(path.parent / name) if is_path(name) else name
-
     jobs: dict[Job, None] = {}
     asked: dict[Cell, dict[Setting, None]] = {}
     owners: dict[Cell, Job] = {}
     aliases: dict[Cell, Cell] = {}
-    for group in grid.groups:
-        for method in map(beside, group.methods):
-            for setting in (column.build() for column in group.settings):
-                names = beside(grid.scenario), beside(group.algorithm)
-                first = Job(method, setting, 0, grid.profile, *names, tuple(group.overrides))
-                with naming_file(path):
-                    config = first.config
-                    if config.cell.setting != setting:
-                        given = ", ".join(group.overrides)
-                        raise ConfigError(f"overrides: the setting belongs to settings; got {given!r:.80}")
-                    for seed in group.seeds:
-                        check_seed(config, seed)
-                cell = config.cell
-                owner = _owner(cell, grid.shared)
-                if owner is not None:
-                    aliases[cell] = Cell(owner, setting)
-                    continue
-                earlier = owners.setdefault(cell, first)
-                with naming_file(path):
-                    _check_same(earlier, first)
-                jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
-                others = (other.build() for other in group.elsewhere)
-                asked.setdefault(cell, {}).update(dict.fromkeys(others))
-    for cell, shared in aliases.items():
-        if shared not in owners:
-            raise ConfigError(f"{path}: shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
-    in_order = tuple(sorted(jobs, key=lambda job: job.seed))
     with naming_file(path):
+        grid = section_of(GridConfig, values)
+        for group, first in _cells_asked(grid, path.parent):
+            cell = first.config.cell
+            owner = _owner(cell, grid.shared)
+            if owner is not None:
+                aliases[cell] = Cell(owner, cell.setting)
+                continue
+            earlier = owners.setdefault(cell, first)
+            _check_same(earlier, first)
+            jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
+            asked.setdefault(cell, {}).update(dict.fromkeys(other.build() for other in group.elsewhere))
+        for cell, shared in aliases.items():
+            if shared not in owners:
+                raise ConfigError(f"shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
+        in_order = tuple(sorted(jobs, key=lambda job: job.seed))
         elsewhere = _elsewhere(in_order, grid.elsewhere, asked)
     return Grid(in_order, aliases, grid.frozen, grid.amended, elsewhere)
+
+
+def _cells_asked(grid: GridConfig, folder: Path) -> Iterator[tuple[Group, Job]]:
+    """Yield each cell that a group asks for, as the job of seed 0; its configuration and its seeds are checked.
+
+    :param folder: that paths in the grid are relative to
+    """
+
+    def beside(name: str) -> str:
+        return str(folder / name) if is_path(name) else name
+
+    for group in grid.groups:
+        names = beside(grid.scenario), beside(group.algorithm)
+        for method, column in product(map(beside, group.methods), group.settings):
+            setting = column.build()
+            first = Job(method, setting, 0, grid.profile, *names, tuple(group.overrides))
+            if first.config.cell.setting != setting:
+                given = ", ".join(group.overrides)
+                raise ConfigError(f"overrides: the setting belongs to settings; got {given!r:.80}")
+            for seed in group.seeds:
+                check_seed(first.config, seed)
+            yield group, first
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.records import Run, read_record, read_runs
+from marl_encircle.experiments.records import Run, read_runs
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 
@@ -22,9 +22,7 @@ def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
     for run in runs:
         if run.status != "unfinished":
             config = asked[run.cell, run.seed]
-            path = run_folder(config, run.seed, folder)
-            # Both engines train the same policy, so that a run of either will do.
-            check_same_run(path, config, run.seed, read_record(path).get("engine", "native"))
+            check_same_run(run_folder(config, run.seed, folder), config, run.seed)
     for i, run in enumerate(runs):
         elsewhere = grid.elsewhere.get(run.cell, ())
         runs[i] = replace(run, elsewhere={each: run.elsewhere[each] for each in elsewhere if each in run.elsewhere})

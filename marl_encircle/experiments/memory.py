@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.sizes import count_weights, observation_size
+from marl_encircle.experiments.sizes import buffer_world_steps, count_weights, observation_size
 from marl_encircle.experiments.yaml_files import ConfigError
 
 CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -29,12 +29,12 @@ def check_memory(needed: Mapping[str, int], available: int) -> None:
 
 
 def memory_needed(config: Config) -> dict[str, int]:
-    """Return the least memory [bytes] that a training takes, by the key that asks for it."""
+    """Return the least memory [bytes] that a training takes that can be resumed, by the key that asks for it."""
     a, scenario = config.algorithm, config.scenario
     n, size = scenario.pursuers, observation_size(scenario)
-    steps = min(a.buffer_world_steps, config.training.world_steps + config.training.n_worlds)
+    steps = buffer_world_steps(a, config.training)
     transition = 4 * n * (2 * size + 5)  # two observations, two actions, reward, done, time limit in single precision
-    joint = 4 * n * n * (size + 2)  # each critic's input
+    joint = 4 * n * (size + 2)  # what all critics read
     hidden = 4 * n * sum(a.net_arch)
     return {
         "algorithm.buffer_world_steps": 2 * steps * transition,  # beside that of the checkpoint it resumes from

@@ -136,14 +136,14 @@ class Difference(NamedTuple):
         return float(2 * stats.t.sf(abs(self.mean) / half * _student_quantile(self.seeds - 1), self.seeds - 1))
 
 
-def holm(p_values: Sequence[float], level: float = 1 - CONFIDENCE) -> list[bool]:
-    """Return which hypotheses Holm's step-down procedure rejects: the error over all of them is at most the level.
+def holm(p_values: Sequence[float]) -> list[bool]:
+    """Return which hypotheses Holm's step-down procedure rejects: the error over all of them is at most 5 %.
 
     :param p_values: of each hypothesis
     """
     rejected = [False] * len(p_values)
     for k, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
-        if p_values[i] > level / (len(p_values) - k):
+        if p_values[i] > (1 - CONFIDENCE) / (len(p_values) - k):
             break
         rejected[i] = True
     return rejected

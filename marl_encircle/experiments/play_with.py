@@ -116,8 +116,10 @@ def play_with(
     bar = ProgressBar(
         world_steps, lambda: model.num_timesteps // n, lambda step: _ended_returns(step, n), "return {:.2f}"
     )
+    guard = _Guard()
     try:
-        model.learn(world_steps * n, callback=CallbackList([_Guard(), *([bar] if progress_bar else [])]))
+        model.learn(world_steps * n, callback=CallbackList([guard, *([bar] if progress_bar else [])]))
+        guard.check()  # the last updates too
     except RuntimeError as error:  # SuperSuitVecEnv's, about how rounds end
         raise ConfigError(f"{name}: {error}") from error
     finally:
@@ -142,11 +144,15 @@ class _Guard(BaseCallback):
     model: MADDPG
 
     def _on_rollout_start(self) -> None:
-        if reason := fault(self.model):
-            raise Diverged(f"diverged: {reason} after {self.num_timesteps:,} agent steps; try another --seed")
+        self.check()
 
     def _on_step(self) -> bool:
         return True
+
+    def check(self) -> None:
+        """Look at the updates that were made since the last rollout."""
+        if reason := fault(self.model):
+            raise Diverged(f"diverged: {reason} after {self.model.num_timesteps:,} agent steps; try another --seed")
 
 
 def _ended_returns(step: BaseCallback, n_agents: int) -> list[float]:

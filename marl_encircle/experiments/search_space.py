@@ -251,4 +251,4 @@ def _is_tried(dimension: Dimension, value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not dimension.low <= value <= dimension.high:
         return False
     steps = (value - dimension.low) / (dimension.step or 1)
-    return (dimension.step is None and not dimension.is_whole) or steps == int(steps)
+    return (dimension.step is None and not dimension.is_whole) or abs(steps - round(steps)) < 1e-8  # as Optuna does

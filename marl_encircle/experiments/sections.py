@@ -103,7 +103,7 @@ class RewardConfig(Section):
         return Reward(self.terms, self.closure, self.two_stage, self.scale)
 
 
-class Schedule(Section):
+class ScheduleConfig(Section):
     """A straight line from ``start`` to ``end`` over ``world_steps``, then ``end``."""
 
     start: Annotated[float, Field(ge=0, le=10)]
@@ -128,14 +128,14 @@ class AlgorithmConfig(GrownSection):
     random_world_steps: Annotated[int, Field(ge=0)]
     train_freq: Count
     gradient_steps: Count
-    exploration_noise: Schedule
+    exploration_noise: ScheduleConfig
     exploration_random: Share
     learning_rate_end: Annotated[float, Field(gt=0, le=1)] | None = None
     n_steps: Annotated[int, Field(ge=1, le=1000)] = 1
     features: Features = "observation"
 
 
-class Ramp(Section):
+class RampConfig(Section):
     """A scenario field that moves in a straight line from ``start`` to its final value over ``world_steps``."""
 
     start: float
@@ -143,7 +143,8 @@ class Ramp(Section):
 
 
 Curriculum = Annotated[
-    dict[Literal["safety_distance", "obstacle_radius", "speed_ratio"], Ramp | None], BeforeValidator(_off_as_empty)
+    dict[Literal["safety_distance", "obstacle_radius", "speed_ratio"], RampConfig | None],
+    BeforeValidator(_off_as_empty),
 ]
 """null switches all of it off."""
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 from marl_encircle.core.observations import layout
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.experiments.sections import AlgorithmConfig, Features
+from marl_encircle.experiments.sections import AlgorithmConfig, Features, TrainingConfig
 
 NEAREST = {"pursuers": 4, "obstacles": 3}
 """How many bodies of each kind the features ``set`` show."""
@@ -14,7 +14,7 @@ BODY_SIZE = 8
 
 
 def count_weights(scenario: Scenario, algorithm: AlgorithmConfig) -> dict[str, int]:
-    """Return the number of weights of all actors and of all critics, one a pursuer or a shared one."""
+    """Return the number of weights of all actors and of one set of critics, one a pursuer or a shared one."""
     n, hidden = scenario.pursuers, algorithm.net_arch
     size = features_size(scenario, algorithm.features)
     actor, joint = weights_between([size, *hidden, 2]), n * (size + 2)
@@ -23,6 +23,11 @@ def count_weights(scenario: Scenario, algorithm: AlgorithmConfig) -> dict[str, i
     else:
         critics = n * weights_between([joint, *hidden, 1])
     return {"actors": actor if algorithm.features == "set" else n * actor, "critics": critics}
+
+
+def buffer_world_steps(algorithm: AlgorithmConfig, training: TrainingConfig) -> int:
+    """Return the world steps that the replay buffer holds: room for more than the training has would cost memory."""
+    return min(algorithm.buffer_world_steps, training.world_steps + training.n_worlds)
 
 
 def weights_between(sizes: list[int]) -> int:

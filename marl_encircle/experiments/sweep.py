@@ -110,7 +110,7 @@ def sweep(
     :param executor: how they run; by default as processes of this machine
     :return: how it ended; ``failed`` names the runs that did not finish
     :raises ConfigError: for a run that cannot be trained, or too many at a time for this machine's memory, before
-        anything is written
+        anything is written; other executors' machines are not known
     :raises FolderLockedError: if another sweep works in ``out``
     :raises OtherRunError: if a finished run there has another configuration
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints

@@ -258,20 +258,25 @@ def ended_run(folder: Path, config: Config, seed: int, engine: Engine | None = N
     """
     if not (folder / RECORD).exists():
         return None
-    record = read_record(folder)
-    check_same_run(folder, config, seed, engine or record.get("engine", "native"))
+    record = check_same_run(folder, config, seed, engine)
     if record["status"] == "finished":
         checkpoint.remove(folder)
     return record
 
 
-def check_same_run(folder: Path, config: Config, seed: int, engine: Engine) -> None:
-    """Raise an OtherRunError unless the finished run in ``folder`` is of this configuration, seed and engine."""
-    _check_same(folder, _plan(config, seed, engine), read_record(folder))
+def check_same_run(folder: Path, config: Config, seed: int, engine: Engine | None = None) -> dict[str, Any]:
+    """Return the record of the run that has ended in ``folder``.
+
+    :param engine: None: either will do, since both train the same policy
+    :raises OtherRunError: if it is of another configuration, seed or engine
+    """
+    record = read_record(folder)
+    _check_same(folder, _plan(config, seed, engine or record.get("engine", "native")), record)
+    return record
 
 
 def _check_placement(config: Config) -> None:
-    """Place the bodies once at the first and at the final difficulty; raise a PlacementError where they do not fit."""
+    """Place bodies at the first and at the final difficulty; raise a PlacementError where they do not fit."""
     first = {name: ramp.start for name, ramp in config.training.curriculum.items() if ramp is not None}
     for difficulty in (first, {}):
         simulator = Simulator(config.scenario, n_worlds=16, seed=0)

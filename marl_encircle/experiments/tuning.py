@@ -39,7 +39,7 @@ STUDY = "study.db"
 def tune(
     space: Space, out: str | Path, n_trials: int, n_workers: int, report: Callable[[Row], None] = lambda _: None
 ) -> Outcome:
-    """Try values until there are ``n_trials`` trials, those of earlier calls and those given up included.
+    """Try values until there are ``n_trials`` trials, earlier calls' and pruned ones included.
 
     The first trial has the values of the files that are searched from, as far as they are among those tried.
 

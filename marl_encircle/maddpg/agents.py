@@ -53,12 +53,18 @@ def count_agents(env: GymEnv | None, n_agents: int | None) -> int:
     return n
 
 
-def names_of_agents(env: GymEnv | None, n_agents: int) -> tuple[str, ...] | None:
+def names_of_agents(env: GymEnv | None, n_agents: int, known: tuple[str, ...] | None) -> tuple[str, ...] | None:
     """Return the agents' names in the order of the slots.
 
     :param env: an environment tells them by an attribute ``agents``
     :param n_agents: number of agents N
-    :return: None where there is no such attribute, or it does not name each agent of a world
+    :param known: the names until now, which stay where there is no such attribute, or it does not name each agent of a
+        world
+    :raises ValueError: for the same names in another order: each actor would act for another agent
     """
     agents = getattr(env, "agents", None) if isinstance(env, VecEnv) else None
-    return tuple(agents) if isinstance(agents, list | tuple) and len(agents) == n_agents else None
+    if not isinstance(agents, list | tuple) or len(agents) != n_agents:
+        return known
+    if known is not None and tuple(agents) != known and set(agents) == set(known):
+        raise ValueError(f"the environment's agents are {list(agents)}, but the actors are those of {list(known)}")
+    return tuple(agents)

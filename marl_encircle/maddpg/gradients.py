@@ -105,5 +105,7 @@ def _differentiate(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> th.Te
     parameters = list(parameters)
     for parameter in parameters:
         parameter.grad = None
-    th.autograd.backward(loss, inputs=[parameter for parameter in parameters if parameter.requires_grad])
+    learning = [parameter for parameter in parameters if parameter.requires_grad]
+    if learning:
+        th.autograd.backward(loss, inputs=learning)
     return loss.detach()

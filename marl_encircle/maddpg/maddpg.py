@@ -74,6 +74,7 @@ class MADDPG(SavedOffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
+    n_critics: ClassVar[int] = 1
     policy: MADDPGPolicy
     actor: Actor
     actor_target: Actor
@@ -131,7 +132,7 @@ class MADDPG(SavedOffPolicyAlgorithm):
         )
         self.n_agents = n_agents
         self.agents: tuple[str, ...] | None = None
-        self.n_steps = n_steps  # not to SB3, whose own buffer would be asked for
+        self.n_steps = self.replay_buffer_kwargs.get("n_steps", n_steps)  # not SB3's, which asks for its own buffer
         self.critic_kind = critic
         if exploration_noise is None:
             exploration_noise = 0.3 if action_noise is None else 0.0
@@ -141,6 +142,9 @@ class MADDPG(SavedOffPolicyAlgorithm):
         check_range("gamma", gamma, 0, 1)
         check_range("tau", tau, 0, 1)
         check_range("policy_delay", policy_delay, 1)
+        check_range("actor_regularization", actor_regularization, 0)
+        if "critic" in self.policy_kwargs:
+            raise ValueError(f"critic is an argument of {type(self).__name__}, not of policy_kwargs")
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise ValueError(f"max_grad_norm must be positive or None, but got {max_grad_norm}")
         self.policy_delay = policy_delay
@@ -163,7 +167,7 @@ class MADDPG(SavedOffPolicyAlgorithm):
                 "environments have continuous actions by an argument, MPE's by continuous_actions=True"
             )
         self.n_agents = count_agents(self.env, self.n_agents)
-        self.agents = names_of_agents(self.env, self.n_agents) or self.agents
+        self.agents = names_of_agents(self.env, self.n_agents, self.agents)
         if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
             self.action_noise = self.action_noise.base_noise  # SB3 makes one of it for as many slots as there are
         # The exploration's own generator goes on where a loaded model stopped
@@ -217,11 +221,13 @@ class MADDPG(SavedOffPolicyAlgorithm):
 
         :param env: the environment
         :param force_reset: whether it is reset before training
-        :raises ValueError: where the number of agents differs
+        :raises ValueError: where the number of agents or their order differs, and for a PettingZoo environment that is
+            not wrapped
         """
-        n_agents = count_agents(env, self.n_agents)
+        refuse_pettingzoo(env)
+        agents = names_of_agents(env, count_agents(env, self.n_agents), self.agents)
         super().set_env(env, force_reset)
-        self.agents = self.policy.agents = names_of_agents(env, n_agents) or self.agents
+        self.agents = self.policy.agents = agents
 
     def train(self, gradient_steps: int, batch_size: int = 1024) -> None:
         """Update critics, actors and targets from the replay buffer.

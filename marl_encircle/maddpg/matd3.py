@@ -5,6 +5,7 @@ from typing import Any, ClassVar, TypeVar
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples
 
+from marl_encircle.maddpg.arguments import check_range
 from marl_encircle.maddpg.maddpg import MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -36,6 +37,8 @@ class MATD3(MADDPG):
         target_noise_clip: float = 0.5,
         **kwargs: Any,
     ) -> None:
+        check_range("target_policy_noise", target_policy_noise, 0)
+        check_range("target_noise_clip", target_noise_clip, 0)
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
         super().__init__(policy, env, *args, policy_delay=policy_delay, **kwargs)

@@ -1,6 +1,6 @@
 """Networks with an agent axis: N multilayer perceptrons as one, evaluated by one batched product a layer.
 
-Shape legend: B minibatch, N agents, O observation size, U action size, H size of the last hidden layer.
+Shape legend: B minibatch, N agents, O observation size, U action size, H size of a hidden layer.
 """
 
 import math

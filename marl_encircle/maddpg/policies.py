@@ -39,7 +39,7 @@ class MADDPGPolicy(BasePolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: one optimizer for all actors, one for all critics
     :param optimizer_kwargs: its keyword arguments, except the learning rate; Adam is fused unless told otherwise
-    :param share_parameters: one actor for all agents; the critics stay as ``critic`` says
+    :param share_parameters: one actor for all agents, its features extractor too; the critics stay as ``critic`` says
     :param agents: the agents' names in the order of the slots, where they are known: whose observation is whose in a
         dict
     :raises ValueError: for a ``critic`` that there is not
@@ -125,15 +125,15 @@ class MADDPGPolicy(BasePolicy):
             for name, buffer in network.named_buffers(recurse=False):
                 getattr(target, name).copy_(buffer)
 
-    def make_features_extractor(self) -> AgentFeatures:
-        """SB3's extractor for one observation, copied for every agent if it learns."""
+    def make_features_extractor(self, shared: bool = False) -> AgentFeatures:
+        """SB3's extractor for one observation, copied for every agent if it learns and is not to be shared."""
         first = super().make_features_extractor()
         learns = any(True for _ in first.parameters())
-        n_more = self.n_agents - 1 if learns and not self.share_parameters else 0
+        n_more = self.n_agents - 1 if learns and not shared else 0
         more = [super(MADDPGPolicy, self).make_features_extractor() for _ in range(n_more)]
         return AgentFeatures(self.observation_space, [first, *more], self.n_agents)
 
-    def _net_args(self) -> dict[str, Any]:
+    def _net_args(self, shared_features: bool = False) -> dict[str, Any]:
         return self._update_features_extractor(
             {
                 "observation_space": self.observation_space,
@@ -141,13 +141,15 @@ class MADDPGPolicy(BasePolicy):
                 "n_agents": self.n_agents,
                 "activation_fn": self.activation_fn,
                 "normalize_images": self.normalize_images,
-            }
+            },
+            self.make_features_extractor(shared_features),
         )
 
     def make_actor(self) -> Actor:
         """Return new actors."""
         net_arch, _ = get_actor_critic_arch(self.net_arch)
-        return Actor(**self._net_args(), net_arch=net_arch, share_parameters=self.share_parameters).to(self.device)
+        shared = self.share_parameters
+        return Actor(**self._net_args(shared), net_arch=net_arch, share_parameters=shared).to(self.device)
 
     def make_critic(self) -> CentralCritic:
         """Return new critics."""
@@ -198,12 +200,12 @@ class MADDPGPolicy(BasePolicy):
         :raises ValueError: where observations of some agents are missing
         """
         if not isinstance(observation, Mapping):
-            shape = np.shape(observation)
-            if shape[2:] != self.observation_space.shape:  # slots
+            shape: tuple[int, ...] = getattr(observation, "shape", ())
+            if len(shape) != len(self.observation_space.shape or ()) + 2:  # slots
                 return super().predict(observation, state, episode_start, deterministic)
             if shape[1] != self.n_agents:
                 raise ValueError(f"predict needs the observations of all {self.n_agents} agents, but got {shape[1]}")
-            slots = np.concatenate(observation)
+            slots = observation.reshape(-1, *shape[2:])
             actions, state = super().predict(slots, state, episode_start, deterministic)
             return actions.reshape(*shape[:2], *actions.shape[1:]), state
         agents = self.agents or tuple(observation)

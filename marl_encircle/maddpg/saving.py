@@ -1,18 +1,22 @@
 """Files in SB3's format: a zip-file of pickled objects and weights, which can run code when it is loaded."""
 
 import io
+import json
 import pathlib
 import warnings
+import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
+from stable_baselines3.common.save_util import load_from_zip_file, open_path
 from stable_baselines3.common.type_aliases import GymEnv
 
 from marl_encircle import files
+from marl_encircle.maddpg.agents import refuse_pettingzoo
 from marl_encircle.maddpg.buffers import JointReplayBuffer
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -26,7 +30,7 @@ class UntrustedFileWarning(UserWarning):
 class SavedOffPolicyAlgorithm(OffPolicyAlgorithm):
     """SB3's off-policy algorithm with files that are written whole or not at all, and refused where they do not fit."""
 
-    n_critics: ClassVar[int] = 1
+    saved_by: str
     n_agents: int | None
     n_steps: int
     replay_buffer: JointReplayBuffer | None
@@ -44,6 +48,7 @@ class SavedOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param include: attributes to save although SB3 leaves them out
         :raises OSError: with the file's name; the former file is unchanged
         """
+        self.saved_by = type(self).__name__
         with whole_file(path, ".zip") as target:
             super().save(target, exclude, include)
 
@@ -63,18 +68,29 @@ class SavedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param path: the file
         :param truncate_last_traj: unused, SB3's interface
-        :raises ValueError: if it was made for other slots, agents or returns; the former buffer stays
+        :raises ValueError: if it was made for other spaces, slots, agents or returns; the former buffer stays
         """
         former = self.replay_buffer
+        must_be = {
+            "obs_shape": get_obs_shape(self.observation_space),
+            "action_dim": get_action_dim(self.action_space),
+            "n_envs": self.n_envs,
+            "n_agents": self.n_agents,
+            "n_steps": self.n_steps,
+        }
+        if self.n_steps > 1:
+            must_be["gamma"] = self.replay_buffer_kwargs.get("gamma", self.gamma)
         try:
             super().load_replay_buffer(path, truncate_last_traj)
-            for name, wanted in {"n_envs": self.n_envs, "n_agents": self.n_agents, "n_steps": self.n_steps}.items():
+            for name, wanted in must_be.items():
                 saved = getattr(self.replay_buffer, name, "none")
                 if saved != wanted:
                     raise ValueError(f"{path} is no replay buffer of this model: its {name} is {saved}, not {wanted}")
         except (ValueError, AssertionError):  # SB3 asserts that it is a replay buffer, once it has taken its place
             self.replay_buffer = former
             raise
+        assert self.replay_buffer is not None
+        self.replay_buffer.end_episodes()  # the model's own worlds may be elsewhere
 
     @classmethod
     def load(
@@ -98,24 +114,29 @@ class SavedOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param custom_objects: objects to use in place of saved ones
         :param print_system_info: whether to print the versions saved and in use
         :param force_reset: whether ``env`` is reset before training
-        :param kwargs: attributes to change
-        :raises ValueError: where the number of agents differs, or another algorithm saved it
+        :param kwargs: attributes to change; a new ``seed`` seeds all generators
+        :raises ValueError: where the number of agents differs, a class saved it that this one does not inherit from,
+            or ``env`` is PettingZoo's
         """
         warnings.warn(
             f"{path} is a zip-file of pickled objects, which can run code when it is loaded: load only what you trust.",
             UntrustedFileWarning,
             stacklevel=2,
         )
+        refuse_pettingzoo(env)
+        name = saved_by(path)
+        foreign = ValueError(f"{path} was saved by {name}, not by {cls.__name__}: use {name}.load")
+        if name not in [base.__name__ for base in cls.__mro__]:
+            raise foreign
         try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except RuntimeError as error:  # PyTorch's, with the names of the weights that one has and the other has not
-            n_critics = saved_critics(path)
-            bases = SavedOffPolicyAlgorithm.__subclasses__()
-            others = [each for base in bases for each in (base, *base.__subclasses__()) if each.n_critics == n_critics]
-            if n_critics == cls.n_critics or not others:
+            if name == cls.__name__:
                 raise
-            name = others[0].__name__
-            raise ValueError(f"{path} was saved by {name}, not by {cls.__name__}: use {name}.load") from error
+            raise foreign from error
+        if kwargs.get("seed") is not None:
+            model.set_random_seed(kwargs["seed"])
+        return model
 
 
 def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
@@ -146,15 +167,21 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
     return policy
 
 
-def saved_critics(path: str | pathlib.Path | io.BufferedIOBase) -> int:
-    """Return how many critics each agent has in a zip-file of ``save``; only tensors are read.
+def saved_by(path: str | pathlib.Path | io.BufferedIOBase) -> str:
+    """Return the name of the class that wrote a zip-file of ``save``; nothing in it is unpickled.
 
     :param path: the file, or an open one
+    :raises ValueError: if it is no such file
     """
-    _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
-    prefix = "critic.q_networks."
-    names = [name for name in cast(dict[str, th.Tensor], parameters.get("policy", {})) if name.startswith(prefix)]
-    return len({name.removeprefix(prefix).partition(".")[0] for name in names})
+    file = open_path(path, "r", suffix="zip")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return str(json.loads(archive.read("data"))["saved_by"])
+    except (zipfile.BadZipFile, ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"{path} is no model that MADDPG or a subclass of it saved") from error
+    finally:
+        if file is not path:
+            file.close()
 
 
 @contextmanager
@@ -165,6 +192,7 @@ def whole_file(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> Ite
         return
     path = pathlib.Path(path)
     path = path if path.suffix else path.with_name(path.name + suffix)
+    path = path.resolve()  # what a link points to
     # Opened here: SB3 would leave it open where the disk is full.
     with files.atomic_path(path) as temporary, temporary.open("wb") as file:
         yield file

@@ -72,9 +72,9 @@ def latex(name: str, caption: str, header: Sequence[str], rows: Sequence[Sequenc
     :param name: of the label, ``tab:<name>``
     """
     body: list[str] = []
-    grouped = any(_is_italic(row[0]) for row in rows)
+    grouped = any(is_italic(row[0]) for row in rows)
     for row in rows:
-        if grouped and body and not _is_italic(row[0]):
+        if grouped and body and not is_italic(row[0]):
             body.append(r"\addlinespace")
         body.append(_latex_row(row))
     tabular = [
@@ -128,19 +128,21 @@ def estimate_columns(name: str, estimate: Estimate | Difference | None, scale: f
     return {key: "" if value is None else f"{scale * value:.4f}" for key, value in zip(columns, values, strict=True)}
 
 
-def _parts(cell: Text) -> tuple[Part, ...]:
+def parts_of(cell: Text) -> tuple[Part, ...]:
+    """Return the pieces of a cell, each of one style."""
     return cell if isinstance(cell, tuple) else (cell,)
 
 
-def _is_italic(cell: Text) -> bool:
-    first = _parts(cell)[0]
+def is_italic(cell: Text) -> bool:
+    """Whether a cell starts in italics, as all of the paper's do."""
+    first = parts_of(cell)[0]
     return isinstance(first, Styled) and first.style == "italic"
 
 
 def _markdown_text(cell: Text) -> str:
     marked = (
         part if isinstance(part, str) else f"{_MARKS[part.style]}{part.text}{_MARKS[part.style]}"
-        for part in _parts(cell)
+        for part in parts_of(cell)
     )
     return "".join(marked)
 
@@ -152,7 +154,7 @@ def _latex_row(cells: Sequence[Text]) -> str:
 def _latex_text(cell: Text) -> str:
     escaped = (
         _escape(part) if isinstance(part, str) else rf"\{_COMMANDS[part.style]}{{{_escape(part.text)}}}"
-        for part in _parts(cell)
+        for part in parts_of(cell)
     )
     return "".join(escaped)
 

@@ -78,15 +78,15 @@ def test_a_callee_that_changed_in_another_file_is_noticed(tmp_path: Path) -> Non
 
 def test_the_hash_is_of_every_source_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compilation, "__file__", str(tmp_path / "compilation.py"))
-    seen = [compilation.source_hash()]
+    seen = [compilation.core_hash()]
     for name, text in (("a.py", "x"), ("b.py", "x"), ("a.py", "y"), ("c.py", "")):
         (tmp_path / name).write_text(text)
-        seen.append(compilation.source_hash())
+        seen.append(compilation.core_hash())
     (tmp_path / "b.py").rename(tmp_path / "d.py")
-    seen.append(compilation.source_hash())
+    seen.append(compilation.core_hash())
     assert len(set(seen)) == 6
     (tmp_path / "notes.txt").write_text("no source")
-    assert compilation.source_hash() == seen[-1]
+    assert compilation.core_hash() == seen[-1]
 
 
 def test_the_folder_is_the_first_of_the_users_that_can_be_written(
@@ -104,7 +104,7 @@ def test_the_folder_is_the_first_of_the_users_that_can_be_written(
     monkeypatch.delenv("MARL_ENCIRCLE_CACHE")
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert compilation.cache_folder().parent.parent == home / ".cache"
-    assert compilation.cache_folder().name == f"numba-{compilation.source_hash()}"
+    assert compilation.cache_folder().name == f"numba-{compilation.core_hash()}"
 
 
 def test_without_any_such_folder_it_is_a_new_private_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from marl_encircle.core.rewards import Reward
 from marl_encircle.core.scenario import Scenario
-from marl_encircle.envs.curriculum import CurriculumVecEnv, Level
+from marl_encircle.envs.curriculum import CurriculumVecEnv, Ramp
 from marl_encircle.envs.encirclement_v0 import parallel_env
 from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
 from marl_encircle.envs.vec_env import EncirclementVecEnv
@@ -27,18 +27,18 @@ def still(venv: Any) -> np.ndarray:
     return np.zeros((venv.num_envs, 2), np.float32)
 
 
-def test_a_level_is_a_straight_line_that_ends_exactly() -> None:
-    level = Level(0.3, 0.11, 100)
-    assert level.at(0) == pytest.approx(0.3)
-    assert level.at(25) == pytest.approx(0.2525)  # 0.3 - 0.19 / 4
-    assert level.at(50) == pytest.approx(0.205)
-    assert level.at(100) == level.at(101) == level.at(10**9) == 0.11
-    assert Level(0.1, 0.4, 10).at(5) == pytest.approx(0.25)
+def test_a_ramp_is_a_straight_line_that_ends_exactly() -> None:
+    ramp = Ramp(0.3, 0.11, 100)
+    assert ramp.at(0) == pytest.approx(0.3)
+    assert ramp.at(25) == pytest.approx(0.2525)  # 0.3 - 0.19 / 4
+    assert ramp.at(50) == pytest.approx(0.205)
+    assert ramp.at(100) == ramp.at(101) == ramp.at(10**9) == 0.11
+    assert Ramp(0.1, 0.4, 10).at(5) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("engine", [native, supersuit])
 def test_difficulty_counts_every_worlds_steps(engine: Any) -> None:
-    venv = CurriculumVecEnv(engine(), {"safety_distance": Level(0.3, 0.11, 30), "speed_ratio": Level(1.0, 1.1, 15)})
+    venv = CurriculumVecEnv(engine(), {"safety_distance": Ramp(0.3, 0.11, 30), "speed_ratio": Ramp(1.0, 1.1, 15)})
     venv.reset()
     for step in range(1, 12):
         venv.step(still(venv))
@@ -49,7 +49,7 @@ def test_difficulty_counts_every_worlds_steps(engine: Any) -> None:
 
 def test_a_world_takes_the_difficulty_of_the_step_in_which_its_round_starts() -> None:
     inner = native()
-    venv = CurriculumVecEnv(inner, {"safety_distance": Level(0.3, 0.1, 30)})
+    venv = CurriculumVecEnv(inner, {"safety_distance": Ramp(0.3, 0.1, 30)})
     venv.reset()
     for step in range(1, 16):
         # rounds last 5 steps; the one that starts in step s sees the difficulty after 3 (s - 1) world steps
@@ -63,7 +63,7 @@ def test_a_world_takes_the_difficulty_of_the_step_in_which_its_round_starts() ->
 def test_worlds_hear_of_changes_only(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[dict[str, float]] = []
     monkeypatch.setattr(EncirclementVecEnv, "set_difficulty", lambda self, difficulty: heard.append(difficulty))
-    venv = CurriculumVecEnv(native(), {"safety_distance": Level(0.3, 0.11, 12)})
+    venv = CurriculumVecEnv(native(), {"safety_distance": Ramp(0.3, 0.11, 12)})
     venv.reset()
     for _ in range(10):
         venv.step(still(venv))
@@ -71,7 +71,7 @@ def test_worlds_hear_of_changes_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [each["safety_distance"] for each in heard] == pytest.approx([0.3, 0.2525, 0.205, 0.1575, 0.11])
 
 
-def test_without_levels_nothing_is_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ramps_nothing_is_changed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EncirclementVecEnv, "set_difficulty", lambda *_: pytest.fail("nobody asked for it"))
     venv = CurriculumVecEnv(native(), {})
     venv.reset()

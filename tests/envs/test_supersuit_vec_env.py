@@ -318,6 +318,35 @@ def an_environment_without_render_mode_is_taken(make: Any) -> None:
     assert make(env).render_mode is None
 
 
+@law(bare_raises=AttributeError)
+def an_environment_without_metadata_is_taken(make: Any) -> None:
+    class Bare(TallyEnv):
+        @property
+        def unwrapped(self) -> "Bare":
+            return self
+
+        def __getattribute__(self, name: str) -> Any:
+            if name == "metadata" and "metadata" not in self.__dict__:
+                raise AttributeError(name)
+            return super().__getattribute__(name)
+
+    assert make(Bare()).num_envs == N
+
+
+@law(bare_raises=AttributeError)
+def infos_that_are_none_hold_nothing(make: Any) -> None:
+    class Silent(TallyEnv):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            return super().reset(seed, options)[0], None
+
+        def step(self, actions: Any) -> Any:
+            return (*super().step(actions)[:4], dict.fromkeys(self.possible_agents))
+
+    venv = make(Silent())
+    venv.reset()
+    assert play(venv, 4)[2].all()
+
+
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.check.__name__)
 def test_our_vec_env_keeps_the_law(law: Law) -> None:
     law.check(SuperSuitVecEnv)

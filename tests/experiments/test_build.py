@@ -22,7 +22,7 @@ from marl_encircle.experiments.build import (
     policy_bytes,
 )
 from marl_encircle.experiments.config import load_config
-from marl_encircle.experiments.sections import Schedule
+from marl_encircle.experiments.sections import ScheduleConfig
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import ALGORITHMS, MADDPG, MATD3
 
@@ -162,7 +162,7 @@ def test_a_buffer_is_no_larger_than_its_training() -> None:
 
 
 def test_the_noise_follows_the_world_steps() -> None:
-    noise = NoiseSchedule(Schedule(start=0.4, end=0.1, world_steps=500), world_steps=2000)
+    noise = NoiseSchedule(ScheduleConfig(start=0.4, end=0.1, world_steps=500), world_steps=2000)
     assert noise(1.0) == pytest.approx(0.4)
     assert noise(1 - 250 / 2000) == pytest.approx(0.25)
     assert noise(1 - 500 / 2000) == noise(0.0) == noise(-0.1) == 0.1

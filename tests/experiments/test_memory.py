@@ -22,8 +22,8 @@ def test_the_memory_that_is_needed_is_that_of_the_arrays() -> None:
     size = observation_size(config.scenario)
     assert memory_needed(config) == {
         "algorithm.buffer_world_steps": 2 * 1000 * 3 * (2 * size + 5) * 4,
-        # a transition, what the three critics see of it (3 x 3 x (size + 2)), two hidden layers of 64 of three pursuers
-        "algorithm.batch_size": 10 * 4 * (3 * (2 * size + 5) + 9 * (size + 2) + 3 * 128),
+        # a transition, what all critics read of it (3 x (size + 2)), two hidden layers of 64 of three pursuers
+        "algorithm.batch_size": 10 * 4 * (3 * (2 * size + 5) + 3 * (size + 2) + 3 * 128),
         # actors size-64-64-2, a shared critic 3 (size + 2)-64-64-3; weight, target, gradient and two moments
         "algorithm.net_arch": 20
         * (

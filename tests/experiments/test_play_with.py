@@ -15,6 +15,7 @@ from marl_encircle.experiments.divergence import Diverged
 from marl_encircle.experiments.play_with import FIRST_ROUND, Played, load_played, play_with, save_policy
 from marl_encircle.experiments.worlds import find_world
 from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.maddpg import MADDPG
 
 
 def played(algorithm: AlgorithmName = "maddpg", world_steps: int = 200, **more: Any) -> Played:
@@ -74,6 +75,15 @@ def test_rounds_that_no_longer_end_together_or_at_all_are_refused(monkeypatch: p
 def test_a_training_that_diverges_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "fault", lambda _: "train/critic_loss is nan")
     with pytest.raises(Diverged, match="diverged: train/critic_loss is nan after 0 agent steps; try another --seed"):
+        played()
+
+
+def test_the_last_updates_of_a_training_are_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def at_the_end(model: MADDPG) -> str | None:
+        return "the actor has weights that are not finite" if model.num_timesteps >= model._total_timesteps else None
+
+    monkeypatch.setattr(module, "fault", at_the_end)
+    with pytest.raises(Diverged, match=r"not finite after \d+ agent steps"):
         played()
 
 

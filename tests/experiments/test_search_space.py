@@ -70,6 +70,12 @@ def test_values_in_use_that_are_not_tried_are_left_to_chance(tmp_path: Path) -> 
     assert load_space(search_file(tmp_path, search=search)).base == {"algorithm.policy_delay": 2}
 
 
+def test_values_in_use_are_tried_wherever_floats_round_a_step(tmp_path: Path) -> None:
+    search = "{algorithm: {gamma: {low: 0.8, high: 0.95, step: 0.05}, tau: {low: 0.005, high: 0.1, step: 0.002}}}"
+    assert (0.9 - 0.8) / 0.05 != 2
+    assert load_space(search_file(tmp_path, search=search)).base == {"algorithm.gamma": 0.9}
+
+
 def test_a_trial_is_trained_with_its_values_and_each_seed(tmp_path: Path) -> None:
     space = load_space(search_file(tmp_path, seeds="[950, 999]"))
     jobs = space.jobs({"algorithm.learning_rate": 3e-5})

@@ -445,7 +445,7 @@ def test_slots_that_hide_their_agents_are_refused_unless_the_number_is_given() -
         make_model(env=HidesAgents(LabelledWorlds()), n_agents=0)
 
 
-def test_a_pettingzoo_environment_and_the_bare_supersuit_wrapper_are_refused() -> None:
+def test_a_pettingzoo_environment_and_the_bare_supersuit_wrapper_are_refused(tmp_path: Path) -> None:
     class Parallel(ParallelEnv):
         metadata: ClassVar[dict[str, Any]] = {"name": "parallel"}
         possible_agents: ClassVar[list[str]] = ["agent_0", "agent_1"]
@@ -460,6 +460,12 @@ def test_a_pettingzoo_environment_and_the_bare_supersuit_wrapper_are_refused() -
 
     with pytest.raises(ValueError, match="SuperSuitVecEnv"):
         make_model(env=Parallel())
+    model = make_model()
+    with pytest.raises(ValueError, match="SuperSuitVecEnv"):
+        model.set_env(Parallel())
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="SuperSuitVecEnv"):
+        load(MADDPG, tmp_path / "model.zip", env=Parallel())
     slots = supersuit.pettingzoo_env_to_vec_env_v1(Parallel())
     env = supersuit.concat_vec_envs_v1(slots, 3, base_class="stable_baselines3")
     assert env.num_envs == 6
@@ -518,12 +524,14 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
         ({"replay_buffer_class": DDPG}, "JointReplayBuffer"),
         ({"use_sde": True}, "use_sde is not for deterministic actors"),
         ({"critic": "central"}, "central"),
+        ({"policy_kwargs": {"critic": "shared"}}, "critic is an argument of MADDPG, not of policy_kwargs"),
         ({"policy_delay": 0}, "policy_delay must be at least 1, but got 0"),
         ({"max_grad_norm": 0.0}, r"max_grad_norm must be positive or None, but got 0\.0"),
         ({"max_grad_norm": -1.0}, r"max_grad_norm must be positive or None, but got -1\.0"),
         ({"train_freq": 0}, "train_freq must be at least 1, but got 0"),
         ({"train_freq": (-1, "episode")}, "train_freq must be at least 1, but got -1"),
         ({"batch_size": 0}, "batch_size must be at least 1, but got 0"),
+        ({"actor_regularization": -1}, "actor_regularization must be at least 0, but got -1"),
         ({"gamma": 1.5}, r"gamma must be between 0 and 1, but got 1\.5"),
         ({"tau": -0.1}, r"tau must be between 0 and 1, but got -0\.1"),
         ({"exploration_noise": -1.0}, r"exploration_noise must be at least 0, but got -1\.0"),
@@ -536,6 +544,12 @@ def test_set_env_and_load_compare_the_number_of_agents(tmp_path: Path) -> None:
 def test_what_is_not_supported_is_refused(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises((ValueError, AssertionError), match=message):
         make_model(**kwargs)
+
+
+@pytest.mark.parametrize("name", ["target_policy_noise", "target_noise_clip"])
+def test_noise_on_target_actions_is_not_negative(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"{name} must be at least 0, but got -0\.5"):
+        make_model(MATD3, **{name: -0.5})
 
 
 def test_training_by_episodes_needs_one_world() -> None:
@@ -585,6 +599,23 @@ def test_a_dict_is_read_by_name_where_the_environment_names_its_agents(tmp_path:
             assert all((actions[name] == expected[name]).all() for name in Named.agents)
 
 
+def test_agents_in_another_order_are_refused_since_actors_are_by_place(tmp_path: Path) -> None:
+    class Named(LabelledWorlds):
+        agents = ("left", "middle", "right")
+
+    class Reordered(LabelledWorlds):
+        agents = ("right", "middle", "left")
+
+    model = make_model(env=Named())
+    message = r"agents are \['right', 'middle', 'left'\], but the actors are those of \['left', 'middle', 'right'\]"
+    with pytest.raises(ValueError, match=message):
+        model.set_env(Reordered())
+    assert model.agents == Named.agents
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=message):
+        load(MADDPG, tmp_path / "model.zip", env=Reordered())
+
+
 def test_the_names_are_those_of_the_environment_that_is_set_last() -> None:
     class Named(LabelledWorlds):
         agents = ("left", "middle", "right")
@@ -622,6 +653,12 @@ def test_what_does_not_name_each_agent_of_a_world_is_no_names(agents: Any) -> No
 def test_predict_refuses_observations_of_some_agents(observation: Any) -> None:
     with pytest.raises(ValueError, match="observations of all 3 agents"):
         make_model().predict(observation)
+
+
+def test_what_gymnasium_returns_from_a_reset_is_refused_as_sb3_does() -> None:
+    model = MADDPG("MlpPolicy", "Pendulum-v1", device="cpu")
+    with pytest.raises(ValueError, match="mixing Gym API with SB3 VecEnv API"):
+        model.predict(gym.make("Pendulum-v1").reset())  # type: ignore[arg-type]  # the mistake
 
 
 def test_what_is_missing_to_predict_is_said_with_its_shape() -> None:
@@ -757,6 +794,38 @@ def test_a_saved_model_acts_alike_and_learns_on_with_any_number_of_worlds(
     np.testing.assert_array_equal(without_env.predict(obs)[0], model.predict(obs)[0])
 
 
+def test_a_loaded_model_with_a_new_seed_explores_anew(tmp_path: Path) -> None:
+    make_model().learn(60).save(tmp_path / "model.zip")
+    draws = [load(MADDPG, tmp_path / "model.zip", seed=seed).exploration_rng.random() for seed in (1, 2, 1)]
+    assert draws[0] == draws[2] != draws[1]
+
+
+class Twin(MADDPG):
+    """A user's own: two critics, but none of MATD3's noise."""
+
+    n_critics = 2
+
+
+def test_a_model_is_loaded_by_its_class_or_one_that_inherits_from_it(tmp_path: Path) -> None:
+    class Further(Twin):
+        pass
+
+    make_model(Twin).save(tmp_path / "twin.zip")
+    for cls in Twin, Further:
+        assert type(load(cls, tmp_path / "twin.zip")) is cls
+    for cls in MADDPG, MATD3:
+        with pytest.raises(ValueError, match=rf"was saved by Twin, not by {cls.__name__}: use Twin\.load"):
+            load(cls, tmp_path / "twin.zip")
+
+
+def test_a_file_of_another_library_is_refused_by_name(tmp_path: Path) -> None:
+    DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(tmp_path / "ddpg.zip")
+    (tmp_path / "text.zip").write_text("no zip-file")
+    for name in "ddpg.zip", "text.zip":
+        with pytest.raises(ValueError, match=rf"{name} is no model that MADDPG or a subclass of it saved"):
+            load(MADDPG, tmp_path / name)
+
+
 @pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize(("cls", "other"), [(MADDPG, MATD3), (MATD3, MADDPG)])
 def test_a_file_of_the_other_algorithm_is_refused_with_the_class_that_loads_it(
@@ -828,10 +897,13 @@ def test_going_on_without_a_reset_cuts_nothing() -> None:
     ("other", "difference"),
     [
         ({"n_steps": 1}, "n_steps is 1, not 3"),
+        ({"gamma": 0.9}, r"gamma is 0\.9, not 0\.95"),
         ({"env": LabelledWorlds(n_worlds=2)}, "n_envs is 6, not 12"),
+        ({"env": LabelledWorlds(action_size=1)}, "action_dim is 1, not 2"),
+        ({"env": IdentityWorlds(n_worlds=4)}, r"obs_shape is \(1,\), not \(3,\)"),
         ({"env": LabelledWorlds(n_worlds=6, n_agents=2)}, "n_agents is 2, not 3"),
     ],
-    ids=["n_steps", "worlds", "agents"],
+    ids=["n_steps", "gamma", "worlds", "actions", "observations", "agents"],
 )
 def test_a_replay_buffer_of_another_model_is_refused_and_the_own_one_stays(
     tmp_path: Path, other: dict[str, Any], difference: str
@@ -842,6 +914,16 @@ def test_a_replay_buffer_of_another_model_is_refused_and_the_own_one_stays(
     with pytest.raises(ValueError, match=rf"buffer\.pkl is no replay buffer of this model: its {difference}"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is own
+
+
+def test_a_replay_buffer_made_by_its_keyword_arguments_is_the_own_one(tmp_path: Path) -> None:
+    model = make_model(replay_buffer_kwargs={"n_steps": 3, "gamma": 0.9}).learn(48)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    model.replay_buffer = None  # frees memory before a large one is loaded
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer.dones[model.replay_buffer.pos - 1].all(), "the worlds may be elsewhere by now"
+    assert model.n_steps == 3
+    assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.9)
 
 
 def test_the_own_replay_buffer_stays_where_a_file_holds_none(tmp_path: Path) -> None:
@@ -890,12 +972,29 @@ def test_the_actors_are_plain_named_tensors() -> None:
     }
 
 
+@pytest.mark.parametrize("frozen", ["actor", "critic"])
+def test_a_frozen_network_stays_as_it_is_while_the_other_learns(frozen: str) -> None:
+    model = make_model(MATD3, max_grad_norm=1.0)
+    networks = {"actor": model.actor, "critic": model.critic}
+    networks[frozen].requires_grad_(False)
+    before = {name: weights(network) for name, network in networks.items()}
+    model.learn(120)
+    assert {name for name in networks if not th.equal(weights(networks[name]), before[name])} == {*networks} - {frozen}
+
+
 def test_shared_parameters_are_one_actor_for_all() -> None:
     model = make_model(policy_kwargs={"net_arch": [8], "share_parameters": True})
     model.learn(120)
     assert {len(tensor) for tensor in model.policy.actor_state_dict().values()} == {1}
     same = model.predict(np.ones((3, 3), np.float32))[0]
     np.testing.assert_array_equal(same, same[[0, 0, 0]])
+
+
+def test_critics_keep_their_own_features_where_actors_share_them() -> None:
+    kwargs = {"net_arch": [8], "features_extractor_class": LearntFeatures, "share_parameters": True}
+    model = make_model(policy_kwargs=kwargs)
+    networks = model.actor, model.actor_target, model.critic, model.critic_target
+    assert [len(network.features_extractor.extractors) for network in networks] == [1, 1, 3, 3]
 
 
 class LearntFeatures(BaseFeaturesExtractor):
@@ -945,14 +1044,18 @@ def test_images_are_seen_by_the_cnn_policy() -> None:
     class Pictures(LabelledWorlds):
         def __init__(self) -> None:
             super().__init__(n_worlds=1, n_agents=2)
-            self.observation_space = spaces.Box(0, 255, (1, 36, 36), np.uint8)
+            self.observation_space = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 
         def observe(self) -> np.ndarray:
-            return np.full((2, 1, 36, 36), self.time[0], np.uint8)
+            return np.full((2, 36, 40, 3), self.time[0], np.uint8)
 
     model = MADDPG("CnnPolicy", Pictures(), device="cpu", learning_starts=4, batch_size=4, buffer_size=40)
     model.learn(8)
     assert model._n_updates == 2
+    slots = np.random.default_rng(0).integers(0, 256, (6, 36, 40, 3), np.uint8)
+    np.testing.assert_array_equal(
+        model.predict(slots.reshape(3, 2, 36, 40, 3))[0].reshape(6, 2), model.predict(slots)[0]
+    )
 
 
 def test_float64_policies_train_in_float64() -> None:

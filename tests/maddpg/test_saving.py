@@ -32,6 +32,14 @@ def test_suffixes_and_missing_folders_are_added_as_sb3_does(tmp_path: Path) -> N
         model.load_replay_buffer(tmp_path / "new" / "buffer")
 
 
+def test_what_a_link_points_to_is_written(tmp_path: Path) -> None:
+    (tmp_path / "latest.zip").symlink_to("model.zip")
+    model = make_model()
+    model.save(tmp_path / "latest")
+    assert (tmp_path / "latest.zip").is_symlink()
+    assert weights_hash(load(MADDPG, tmp_path / "model.zip")) == weights_hash(model)
+
+
 def test_an_open_file_is_written_to_as_it_is() -> None:
     model, data, buffer = make_model(), io.BytesIO(), io.BytesIO()
     model.save(data)

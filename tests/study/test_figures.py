@@ -26,20 +26,21 @@ from marl_encircle import files
 from marl_encircle.drawing.palette import PURSUERS, SERIES
 from marl_encircle.experiments import grid as grids
 from marl_encircle.experiments.config import Config, load_config
+from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import share_interval, summarise_cell
 from marl_encircle.experiments.records import Cell, Setting
-from marl_encircle.experiments.train import OtherRunError, run_folder, train
+from marl_encircle.experiments.train import OtherRunError, run_folder, train, write_episodes
 from marl_encircle.replays.replay import Replay, record_round
-from marl_encircle.study.figures import canvas, curves, situations
+from marl_encircle.study.figures import canvas, curves, situations, write
 from marl_encircle.study.figures.canvas import encode, rgb
 from marl_encircle.study.figures.contributions import draw_figure5
 from marl_encircle.study.figures.curves import Band, band_of, draw_figure4
 from marl_encircle.study.figures.rounds import Choice, Column, choose_round, draw_figure6
 from marl_encircle.study.figures.situations import SITUATIONS, draw_figure1, draw_figure3, moment_of
-from marl_encircle.study.figures.write import write_figures
+from marl_encircle.study.figures.write import encode_figures, write_figures
 
 OPEN, OBSTACLE = curves.SETTINGS
 NAMES = ("figure1", "figure3", "figure4", "figure4_all", "figure5", "figure6")
@@ -330,6 +331,22 @@ def test_all_figures_are_written_and_the_same_runs_give_the_same_bytes(
     (folder / "progress.csv").write_text("world_steps,success\n1,1.0\n")
     with pytest.raises(files.DamagedFileError, match=r"progress\.csv: changed since it was written"):
         write_figures(tiny_grid, tmp_path)
+
+
+def test_rounds_that_a_run_has_elsewhere_are_not_played_again(
+    tiny_grid: grids.Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(canvas, "_METADATA", {"svg": {"Date": None, "Creator": None}})
+    job = tiny_grid.jobs[0]
+    folder, _ = train(job.config, job.seed, "native", tmp_path / "runs")
+    before = encode_figures(tiny_grid, tmp_path)
+    policy, config, _ = load_run(folder)
+    scenes = tuple(job.setting._replace(scene=scene) for scene in ("concave", "tunnel"))
+    for scene in scenes:
+        rounds = play_rounds(policy, config, config.evaluation.episodes, config.evaluation.seed, scene)
+        write_episodes(folder, rounds, scene)
+    monkeypatch.delattr(write, "play_rounds")
+    assert encode_figures(tiny_grid._replace(elsewhere={config.cell: scenes}), tmp_path) == before
 
 
 def test_a_run_of_another_configuration_is_not_drawn(tiny_grid: grids.Grid, tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def played(number: int = 0, **scenario: Any) -> Replay:
     overrides = ["scenario.movement_range_limit=4", "scenario.max_cycles=40", "evaluation.n_directions=90"]
     config = tiny(overrides=overrides, **scenario)
     th.manual_seed(0)
-    policy = load_policy(finished()) if config.scenario.obstacles == 1 else build_policy(config)
+    policy = load_policy(finished()) if config.scenario.units == 1 else build_policy(config)
     return record_round(policy, config, number, 5)
 
 
@@ -177,9 +177,16 @@ def test_the_rounds_are_the_first_of_the_first_seed_and_end_as_recorded(runs: Pa
 
 
 @pytest.mark.parametrize(
-    "scenario", [{}, {"obstacles": 0}, {"scene": "tunnel"}], ids=["one obstacle", "none", "several discs"]
+    ("scenario", "seen"),
+    [
+        ({}, {0, 2}),
+        ({"obstacles": 0}, {0}),
+        ({"scene": "tunnel"}, {0, 2}),
+        ({"scene": "tunnel", "composite_unit": False}, {0}),
+    ],
+    ids=["one obstacle", "none", "one of several discs", "several discs"],
 )
-def test_what_is_embedded_is_the_replay_within_its_steps(scenario: dict[str, Any]) -> None:
+def test_what_is_embedded_is_the_replay_within_its_steps(scenario: dict[str, Any], seen: set[int]) -> None:
     states = set()
     for number in range(16):
         replay = played(number, **scenario)
@@ -199,7 +206,7 @@ def test_what_is_embedded_is_the_replay_within_its_steps(scenario: dict[str, Any
         np.testing.assert_allclose(found["area"][closed], enclosure.movement_range[:t][closed], rtol=0, atol=0.5001e-5)
         np.testing.assert_array_equal(found["state"], closed.astype(int) + enclosure.complete[:t])
         states |= set(found["state"].tolist())
-    assert ({0} if scenario.get("obstacles") == 0 else {0, 2}) <= states, "else little was compared"
+    assert seen <= states, "else little was compared"
 
 
 def test_a_round_ends_with_its_own_success_or_with_its_time() -> None:

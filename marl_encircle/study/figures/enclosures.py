@@ -154,13 +154,12 @@ def draw_angle(axes: Axes, centre: Array, radius: float, low: float, high: float
         axes.plot(*ends.T, color=rgb(colour), linewidth=1.2, zorder=6)
 
 
-def write_shares(axes: Axes, moment: Snapshot, entities: int, y: float = -0.07) -> None:
+def write_shares(axes: Axes, moment: Snapshot, entities: int) -> None:
     """Write contributing angles below a panel, each beside a dot in the colour of its owner.
 
     :param entities: number of them to write, pursuers first
-    :param y: height of the line [panel heights]
     """
-    step = 1 / entities
+    step, y = 1 / entities, -0.07  # of the panel's width and height
     for entity in range(entities):
         colour = entity_colour(entity, len(moment.pursuers))
         text = f"{math.degrees(moment.contributing_angle[entity]):.0f}°"

@@ -1,7 +1,6 @@
 """From the runs of a grid to the files of all figures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -53,8 +52,7 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     """
     runs = runs_of(grid, folder)
     bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
-    asked = {job.config.cell for job in grid.jobs} | set(grid.aliases)
-    methods = {cell.method for cell in asked if cell.setting in curves.SETTINGS}
+    methods = {cell.method for cell in grid.cells if cell.setting in curves.SETTINGS}
     others = sorted(methods - set(ALL_METHODS))
     return {
         "figure1": draw_figure1(),
@@ -116,8 +114,9 @@ def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
     policy, config, _ = load_run(folder / run_path(run.cell, run.seed))
     rounds, evaluation, scene, note = run.episodes, config.evaluation, place.setting.scene, ""
     if run.cell.setting.scene != scene:
-        there = config.model_copy(update={"scenario": replace(config.scenario, scene=scene)})
-        rounds = tuple(play_rounds(policy, there, evaluation.episodes, evaluation.seed))
+        rounds = run.elsewhere.get(place.setting) or tuple(
+            play_rounds(policy, config, evaluation.episodes, evaluation.seed, place.setting)
+        )
         note = "(trained with discs)"
     choice = choose_round(rounds, config.reward.closure)
     if choice is None:

@@ -29,12 +29,15 @@ def charts(bands: Mapping[Cell, Band], asked: Sequence[Cell], aliases: Mapping[C
     methods = sorted({cell.method for cell in asked}, key=rank)
     settings = sorted({cell.setting for cell in asked})
     drawn = [setting for setting in settings if any(Cell(method, setting) in bands for method in methods)]
-    parts = [_legend([method for method in methods if any(cell.method == method for cell in bands)], methods)]
-    parts += ['<div class="charts">', *(_panel(setting, bands, asked, aliases, methods) for setting in drawn), "</div>"]
+    parts = []
+    if drawn:
+        panels = (_panel(setting, bands, asked, aliases, methods) for setting in drawn)
+        legend = _legend([method for method in methods if any(cell.method == method for cell in bands)], methods)
+        parts += [legend, '<div class="charts">', *panels, "</div>"]
     without = [in_words(setting) for setting in settings if setting not in drawn]
     if without:
         parts.append(f'<p class="quiet">Not run: {escape("; ".join(without))}.</p>')
-    return "\n".join(parts if drawn else parts[3:])
+    return "\n".join(parts)
 
 
 def _legend(drawn: Sequence[str], methods: Sequence[str]) -> str:

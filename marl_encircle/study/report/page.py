@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from marl_encircle.drawing import palette
 from marl_encircle.drawing.palette import Colour
-from marl_encircle.study.typeset import Styled, Table, Text
+from marl_encircle.study.typeset import Table, Text, is_italic, parts_of
 
 PAIRED = ("table2", "table3", "table4")
 """Tables whose cells are ``S [interval] / MEL``: two columns here."""
@@ -113,10 +113,9 @@ def _head(header: Sequence[str], paired: bool) -> str:
 
 def _row(row: Sequence[Text], paired: bool, width: int) -> str:
     first, *cells = row
-    papers = isinstance(first, Styled) or (isinstance(first, tuple) and isinstance(first[0], Styled))
     cells = [*cells, *[""] * (width - 1 - len(cells))]
     body = "".join(map(_pair if paired else _cell, cells))
-    kind = ' class="paper"' if papers else ""
+    kind = ' class="paper"' if is_italic(first) else ""
     return f'<tr{kind}><th scope="row">{_plain(first)}</th>{body}</tr>'
 
 
@@ -137,17 +136,15 @@ def _pair(cell: Text) -> str:
 def _inline(text: Text) -> str:
     """Return escaped HTML, intervals set apart."""
     tags = {"bold": "strong", "italic": "em"}
-    parts = text if isinstance(text, tuple) else (text,)
     marked = "".join(
         _escaped(part) if isinstance(part, str) else f"<{tags[part.style]}>{_escaped(part.text)}</{tags[part.style]}>"
-        for part in parts
+        for part in parts_of(text)
     )
     return _INTERVAL.sub(r' <span class="ci">\1</span>', marked)
 
 
 def _plain(text: Text) -> str:
-    parts = text if isinstance(text, tuple) else (text,)
-    return "".join(_escaped(part if isinstance(part, str) else part.text) for part in parts)
+    return "".join(_escaped(part if isinstance(part, str) else part.text) for part in parts_of(text))
 
 
 def _escaped(text: str) -> str:

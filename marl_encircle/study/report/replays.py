@@ -160,7 +160,7 @@ def _world(setting: Setting, cells: Sequence[ShownCell]) -> dict[str, Any] | Non
     angles, distances = facing_arc(np.array([1.0, 0.0]), setting.speed_ratio)
     return {
         "pursuers": scenario.pursuers,
-        "entities": scenario.pursuers + scenario.obstacles,
+        "entities": scenario.pursuers + scenario.units,
         "discs": len(replay.discs),
         "directions": scenario.n_directions,
         "colours": len(PURSUERS),
