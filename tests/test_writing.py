@@ -175,7 +175,8 @@ OURS = {"files", "checkpoint", "film", "self"}  # their own calls are looked at 
 ALLOWED = {
     "locks.py": ["mkdir", "os.ftruncate", "os.open", "os.write", "unlink"],  # a lock is changed in place
     "core/compilation.py": ["mkdir", "tempfile.TemporaryFile", "tempfile.mkdtemp"],  # Numba's cache
-    "maddpg/saving.py": ["open", "save"],  # a path of `atomic_path`; SB3's to it, as is its `save_replay_buffer`
+    # To read; a path of `atomic_path`; SB3's to it, as is its `save_replay_buffer`
+    "maddpg/saving.py": ["ZipFile", "open", "save"],
     "experiments/build.py": ["save"],  # to bytes
     "experiments/checkpoint.py": ["replace"],  # a damaged checkpoint is put aside
     "experiments/export.py": ["save", "save"],  # to bytes
