@@ -21,12 +21,12 @@ def tensorboard_command(
     Runs that were trained here appear as they were logged, also while they train. Those of a fresh checkout have only
     their learning curves, which are turned into event files in a temporary folder.
     """
-    from marl_encircle.experiments.tensorboard import check_tensorboard, gather
+    from marl_encircle.experiments.tensorboard import check_tensorboard, lay_out
 
     check_tensorboard()
     with TemporaryDirectory(prefix="marl-encircle-") as folder:
         runs = out / "runs"
-        found = gather(runs, Path(folder))
+        found = lay_out(runs, Path(folder))
         if not any(found):
             advice = f"train one with --out {runs}, or give the folder that holds runs/ by --results"
             raise ConfigError(f"{runs}: no runs to show; {advice}")

@@ -218,7 +218,7 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         observations, infos = self.env.reset(seed=seed, options=options)
         self._check_told(observation=observations)
-        self.reset_infos = [dict((infos or {}).get(agent) or {}) for agent in self.possible_agents]
+        self.reset_infos = self._copies(infos)
         # MarkovVectorEnv lays the infos of an automatic reset over those of the last step: leave it none.
         return observations, {}
 
@@ -235,14 +235,14 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         if ended:  # MarkovVectorEnv keeps the last observations while the reset may write into the same arrays
             observations = deepcopy(observations)
         # MarkovVectorEnv writes into the world's own infos: give it copies. SB3VecEnvWrapper drops the truncations.
-        infos = {
-            agent: {
-                **((infos or {}).get(agent) or {}),
-                "TimeLimit.truncated": bool(truncations[agent] and not terminations[agent]),
-            }
-            for agent in self.possible_agents
-        }
-        return observations, rewards, terminations, truncations, infos
+        told = dict(zip(self.possible_agents, self._copies(infos), strict=True))
+        for agent, info in told.items():
+            info["TimeLimit.truncated"] = bool(truncations[agent] and not terminations[agent])
+        return observations, rewards, terminations, truncations, told
+
+    def _copies(self, infos: dict[str, dict[str, Any]] | None) -> list[dict[str, Any]]:
+        """Return a copy of each agent's info, which may be missing."""
+        return [dict((infos or {}).get(agent) or {}) for agent in self.possible_agents]
 
     def _check_told(self, **told: dict[str, Any]) -> None:
         """Refuse what MarkovVectorEnv cannot stack, or makes something else of: a missing reward is 0 to it."""

@@ -126,8 +126,8 @@ def play_with(
         bar.close()
     policy = model.policy
     policy.set_training_mode(False)
-    returns = play_rounds(name, world, lambda seen: np.asarray(policy.predict(seen, deterministic=True)[0]), rounds)
-    random = play_rounds(name, world, random_actions(env.action_space), rounds)
+    returns = play_returns(name, world, lambda seen: np.asarray(policy.predict(seen, deterministic=True)[0]), rounds)
+    random = play_returns(name, world, random_actions(env.action_space), rounds)
     env.close()
     return Played(policy, env.agents, model.num_timesteps // n, returns, random)
 
@@ -161,7 +161,7 @@ def _ended_returns(step: BaseCallback, n_agents: int) -> list[float]:
     return [float(np.mean(ended[first : first + n_agents])) for first in range(0, len(ended), n_agents)]
 
 
-def play_rounds(name: str, world: Callable[[], World], act: Act, rounds: int) -> Returns:
+def play_returns(name: str, world: Callable[[], World], act: Act, rounds: int) -> Returns:
     """Return what each round brought, round r in a world of seed ``FIRST_ROUND + r``.
 
     :raises ConfigError: if a round does not end, or not for all agents at once

@@ -155,7 +155,7 @@ class Shown(NamedTuple):
     """From their own event files."""
 
 
-def gather(runs: Path, folder: Path) -> Shown:
+def lay_out(runs: Path, folder: Path) -> Shown:
     """Lay all runs out for TensorBoard, named ``<method>/<setting>/seed<s>``.
 
     A run with event files of its own is linked to, so that one in training goes on being seen. Of one that has none, as

@@ -124,7 +124,7 @@ class SavedOffPolicyAlgorithm(OffPolicyAlgorithm):
             stacklevel=2,
         )
         refuse_pettingzoo(env)
-        name = saved_by(path)
+        name = class_that_saved(path)
         foreign = ValueError(f"{path} was saved by {name}, not by {cls.__name__}: use {name}.load")
         if name not in [base.__name__ for base in cls.__mro__]:
             raise foreign
@@ -167,7 +167,7 @@ def load_actors(path: str | pathlib.Path) -> MADDPGPolicy:
     return policy
 
 
-def saved_by(path: str | pathlib.Path | io.BufferedIOBase) -> str:
+def class_that_saved(path: str | pathlib.Path | io.BufferedIOBase) -> str:
     """Return the name of the class that wrote a zip-file of ``save``; nothing in it is unpickled.
 
     :param path: the file, or an open one

@@ -24,7 +24,7 @@ from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.descriptions import METRICS, TRAINING, hyperparameters, texts
 from marl_encircle.experiments.learning_curve import count_points
 from marl_encircle.experiments.loading import load_policy
-from marl_encircle.experiments.tensorboard import EventFiles, Picture, gather, is_drawn
+from marl_encircle.experiments.tensorboard import EventFiles, Picture, is_drawn, lay_out
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.thumbnails import thumbnails
 
@@ -66,7 +66,7 @@ def assert_same_curve(events: EventAccumulator, run: Path, pursuers: int) -> Non
 
 
 def test_committed_curves_are_shown_under_the_tags_of_a_training(tmp_path: Path) -> None:
-    shown = gather(RUNS, tmp_path)
+    shown = lay_out(RUNS, tmp_path)
     runs = sorted(path.parent for path in RUNS.glob("*/*/*/run.json"))
     assert sum(shown) == len(runs) >= 22
     for run in runs:
@@ -79,7 +79,7 @@ def test_a_run_with_event_files_is_linked_to_and_goes_on_being_seen(tmp_path: Pa
     run, _ = train.train(tiny(), 1, "native", tmp_path / "runs", tensorboard=True)
     (run / "run.json").unlink()  # still in training, as far as one can see
     (tmp_path / "shown").mkdir()
-    assert gather(tmp_path / "runs", tmp_path / "shown") == (1, 1)
+    assert lay_out(tmp_path / "runs", tmp_path / "shown") == (1, 1)
     link = tmp_path / "shown" / run.relative_to(tmp_path / "runs")
     assert link.is_symlink()
     assert_same_curve(events_of(link), run, 3)
@@ -90,7 +90,7 @@ def test_a_changed_learning_curve_is_refused_by_name(tmp_path: Path) -> None:
     (run / "progress.csv").write_text((run / "progress.csv").read_text().replace("120", "121"))
     (tmp_path / "shown").mkdir()
     with pytest.raises(files.DamagedFileError, match=r"progress\.csv: changed since it was written"):
-        gather(tmp_path / "runs", tmp_path / "shown")
+        lay_out(tmp_path / "runs", tmp_path / "shown")
 
 
 # a training
