@@ -36,7 +36,7 @@ def _configurations_of_its_own() -> Iterator[None]:
     yield
     grid = sys.modules.get("marl_encircle.experiments.grid")
     if grid is not None:
-        grid.read_anew()
+        grid.forget_configs()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -115,9 +115,9 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
     registries: tuple[dict[str, Any], ...] = (TERMS, SCENES, ALGORITHMS)
     before = [dict(registry) for registry in registries]
-    grid.read_anew()
+    grid.forget_configs()
     yield
-    grid.read_anew()
+    grid.forget_configs()
     for registry, entries in zip(registries, before, strict=True):
         registry.clear()
         registry.update(entries)

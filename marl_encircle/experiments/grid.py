@@ -67,7 +67,7 @@ class GridConfig(Section):
     frozen: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
     amended: Annotated[str, Field(min_length=1, max_length=500)] | None = None
     groups: Annotated[list[Group], Field(min_length=1)]
-    shared: list[Shared]
+    shared: Annotated[list[Shared], Field(default_factory=list)]
     elsewhere: Annotated[list[Elsewhere], Field(default_factory=list)]
 
 
@@ -101,7 +101,7 @@ def _config(job: Job) -> Config:
     )
 
 
-def read_anew() -> None:
+def forget_configs() -> None:
     """Forget the configurations of all jobs: the files that they came from may have changed."""
     _config.cache_clear()
 
@@ -135,28 +135,29 @@ def load_grid(name: str) -> Grid:
     :param name: a name in ``configs/paper/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; all configurations are checked too
     """
-    read_anew()
+    forget_configs()
     path = find_file(name, "grid")
     values = read_yaml(path)
     jobs: dict[Job, None] = {}
     asked: dict[Cell, dict[Setting, None]] = {}
-    owners: dict[Cell, Job] = {}
+    first_jobs: dict[Cell, Job] = {}
     aliases: dict[Cell, Cell] = {}
     with naming_file(path):
         grid = section_of(GridConfig, values)
         for group, first in _cells_asked(grid, path.parent):
             cell = first.config.cell
-            owner = _owner(cell, grid.shared)
-            if owner is not None:
-                aliases[cell] = Cell(owner, cell.setting)
+            runs_of = _runs_of(cell, grid.shared)
+            if runs_of is not None:
+                aliases[cell] = Cell(runs_of, cell.setting)
                 continue
-            earlier = owners.setdefault(cell, first)
+            earlier = first_jobs.setdefault(cell, first)
             _check_same(earlier, first)
             jobs |= dict.fromkeys(earlier._replace(seed=seed) for seed in group.seeds)
             asked.setdefault(cell, {}).update(dict.fromkeys(other.build() for other in group.elsewhere))
         for cell, shared in aliases.items():
-            if shared not in owners:
+            if shared not in first_jobs:
                 raise ConfigError(f"shared: {cell.method} takes runs of {shared.method}, which is not in the grid")
+        _check_shared(grid.shared, aliases, first_jobs)
         in_order = tuple(sorted(jobs, key=lambda job: job.seed))
         elsewhere = _elsewhere(in_order, grid.elsewhere, asked)
     return Grid(in_order, aliases, grid.frozen, grid.amended, elsewhere)
@@ -219,7 +220,7 @@ def _elsewhere(
         have rounds of two trainings
     """
     jobs = list(jobs)
-    trained = {job.setting for job in jobs}
+    trained = {job.config.cell for job in jobs}
     played = {cell: list(others) for cell, others in asked.items()}
     for job in jobs:
         for other in asked[job.config.cell]:
@@ -227,10 +228,14 @@ def _elsewhere(
     for i, entry in enumerate(entries):
         if entry.scene not in SCENES:
             raise ConfigError(f"elsewhere.{i}.scene: unknown scene {entry.scene!r:.80}{nearest(entry.scene, SCENES)}")
+        if all(job.setting.obstacles != entry.obstacles for job in jobs):
+            raise ConfigError(f"elsewhere.{i}.obstacles: no setting has {entry.obstacles}")
         for job in jobs:
             other = job.setting._replace(scene=entry.scene)
             others = played[job.config.cell]
-            if job.setting.obstacles != entry.obstacles or other in (*trained, *others):
+            if job.setting.obstacles != entry.obstacles or other in others:
+                continue
+            if job.config.cell._replace(setting=other) in trained:
                 continue
             scenario = job.config.scenario
             if replace(scenario, scene=entry.scene).units != scenario.units:
@@ -245,14 +250,14 @@ def _check_distinct(played: Mapping[Cell, Iterable[Setting]]) -> None:
 
     :param played: cell of a training -> other settings
     """
-    owners = {cell: cell for cell in played}
+    trained_at = {cell: cell for cell in played}
     for cell, others in played.items():
         for other in others:
-            owner = owners.setdefault(Cell(cell.method, other), cell)
-            if owner != cell or other == cell.setting:
+            training = trained_at.setdefault(Cell(cell.method, other), cell)
+            if training != cell or other == cell.setting:
                 raise ConfigError(
                     f"elsewhere: {cell.method} at {_in_words(other)} has the runs of its training at "
-                    f"{_in_words(owner.setting)} already"
+                    f"{_in_words(training.setting)} already"
                 )
 
 
@@ -268,7 +273,18 @@ def _in_words(setting: Setting) -> str:
     return f"{setting.symbols}, {setting.scene}"
 
 
-def _owner(cell: Cell, shared: list[Shared]) -> str | None:
+def _check_shared(shared: Iterable[Shared], aliases: Iterable[Cell], trained: Iterable[Cell]) -> None:
+    """Refuse an entry that means no cell of the grid."""
+    aliases = list(aliases)
+    methods = {cell.method for cell in (*aliases, *trained)}
+    for i, entry in enumerate(shared):
+        if entry.method not in methods:
+            raise ConfigError(f"shared.{i}.method: {entry.method!r:.80} is not here{nearest(entry.method, methods)}")
+        if not any((cell.method, cell.setting.obstacles) == (entry.method, entry.obstacles) for cell in aliases):
+            raise ConfigError(f"shared.{i}.obstacles: no setting of {entry.method} has {entry.obstacles}")
+
+
+def _runs_of(cell: Cell, shared: Iterable[Shared]) -> str | None:
     for entry in shared:
         if entry.method == cell.method and entry.obstacles == cell.setting.obstacles:
             return entry.runs_of

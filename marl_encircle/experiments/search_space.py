@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.faults import section_of
-from marl_encircle.experiments.grid import Job, naming_file, read_anew
+from marl_encircle.experiments.grid import Job, forget_configs, naming_file
 from marl_encircle.experiments.learning_curve import count_points
 from marl_encircle.experiments.library import find_file, is_path
 from marl_encircle.experiments.memory import memory_needed
@@ -187,7 +187,7 @@ def load_space(name: str | Path) -> Space:
     :param name: a name in ``configs/tuning/`` or the path of a YAML file; paths in it are relative to it
     :raises ConfigError: naming file and key; every value that may be tried is checked too
     """
-    read_anew()
+    forget_configs()
     path = find_file(str(name), "tuning")
     values = read_yaml(path)
     for key in ("scenario", "reward", "algorithm"):

@@ -143,10 +143,10 @@ def _row(trial: Trial) -> list[Text]:
 def _measure(protocol: Protocol, changes: Changes, folder: Path) -> Trial:
     """Read the trainings of one scenario."""
     jobs, results, distance, shares = jobs_of(protocol, changes), [], 0.0, []
-    runs = {(run.cell.setting, run.seed): run for run in read_runs(folder, policies=False)}
+    runs = {(run.cell, run.seed): run for run in read_runs(folder, policies=False)}
     for cell in protocol.cells:
         config = next(job.config for job in jobs if job.setting == cell.setting)
-        rounds = {seed: runs[cell.setting, seed].episodes for seed in protocol.seeds}
+        rounds = {seed: runs[config.cell, seed].episodes for seed in protocol.seeds}
         summary = summarise_cell(rounds, config.reward.closure)
         # Without any success a round takes its whole time
         length = summary.mean_episode_length

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from marl_encircle.experiments.choices import Profile
 from marl_encircle.experiments.faults import section_of
-from marl_encircle.experiments.grid import Job, naming_file, read_anew
+from marl_encircle.experiments.grid import Job, forget_configs, naming_file
 from marl_encircle.experiments.library import find_file
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.experiments.sections import Section, SettingConfig
@@ -58,7 +58,7 @@ def load_protocol(name: str) -> Protocol:
     :param name: a name in ``configs/paper/`` or the path of a YAML file
     :raises ConfigError: naming file and key
     """
-    read_anew()
+    forget_configs()
     path = find_file(name, "protocol")
     protocol = _read(path)
     scenarios = 1 + len(protocol.neighbours) + protocol.combinations

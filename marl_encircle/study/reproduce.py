@@ -61,7 +61,10 @@ def reproduce(
         folder = run_folder(job.config, job.seed, runs)
         if not (folder / RECORD).exists():
             continue
-        hashes = read_record(folder)["sha256"]
+        record = read_record(folder)
+        if record["status"] != "finished":
+            continue
+        hashes = record["sha256"]
         settings = (None, *grid.elsewhere.get(job.config.cell, ()))
         # Whatever is stopped between the rounds and their record leaves rounds without a hash.
         missing = [
@@ -70,12 +73,11 @@ def reproduce(
             if (name := episodes_name(setting)) not in hashes or not files.is_kept(folder / name)
         ]
         if missing:
-            policy, config, record = load_run(folder)
-            if record["status"] == "finished":
-                e = config.evaluation
-                for setting in missing:
-                    write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed, setting), setting)
-                evaluated += missing[0] is None
+            policy, config, _ = load_run(folder)
+            e = config.evaluation
+            for setting in missing:
+                write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed, setting), setting)
+            evaluated += missing[0] is None
     trained = progress.done + progress.diverged - progress.reused
     done = Reproduction(trained, evaluated, progress.reused - evaluated, progress)
     if done.has_tables:

@@ -17,7 +17,7 @@ from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import wilson_interval
 from marl_encircle.experiments.provenance import cpu_model
-from marl_encircle.experiments.records import Cell, Setting, episodes_name, read_episodes
+from marl_encircle.experiments.records import RECORD, Cell, Setting, episodes_name, read_episodes
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.study.reproduce import render
 
@@ -57,7 +57,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     """
     texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
-    folders = [folder for folder in folders if files.is_kept(folder / episodes_name())]
+    folders = [folder for folder in folders if (folder / RECORD).exists() and files.is_kept(folder / episodes_name())]
     rounds = equal = 0
     exact = True
     successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)

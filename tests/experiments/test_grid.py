@@ -108,8 +108,10 @@ def test_a_grid_may_say_what_was_amended_since(tmp_path: Path) -> None:
 
 
 def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> None:
-    text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: 1}, {scene: tunnel, obstacles: 2}]\n"
-    assert grid_of(tmp_path, text).elsewhere == {OURS: (ONE._replace(scene="concave"),)}
+    text = GRID.format(method="ours") + "elsewhere: [{scene: concave, obstacles: %d}]\n"
+    assert grid_of(tmp_path, text % 1).elsewhere == {OURS: (ONE._replace(scene="concave"),)}
+    with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere\.0\.obstacles: no setting has 2"):
+        grid_of(tmp_path, text % 2)
     study = {cell: others for cell, others in load_grid("all").elsewhere.items() if cell.method != "generalist"}
     assert {cell.setting.obstacles for cell in study} == {1}
     assert {len(others) for others in study.values()} == {2}
@@ -118,6 +120,13 @@ def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> 
 def test_a_scene_in_which_a_policy_was_trained_is_not_elsewhere(tmp_path: Path) -> None:
     text = GRID.format(method="ours") + "elsewhere: [{scene: random, obstacles: 1}]\n"
     assert grid_of(tmp_path, text).elsewhere == {}
+
+
+def test_a_method_is_played_in_a_scene_in_which_only_another_was_trained(tmp_path: Path) -> None:
+    tunnel = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1, scene: tunnel}"
+    other = f"  - methods: [model_b]\n    settings: [{tunnel}]\n    seeds: [0]\n"
+    text = groups(group("ours", 3), other) + "elsewhere: [{scene: tunnel, obstacles: 1}]\n"
+    assert grid_of(tmp_path, text).elsewhere == {OURS: (ONE._replace(scene="tunnel"),)}
 
 
 def test_a_scene_in_which_no_policy_can_play_is_refused(tmp_path: Path) -> None:
@@ -298,6 +307,8 @@ SETTING = "{speed_ratio: 1.1, pursuers: 3, obstacles: 1}"
         ("shared: []", f"shared: []\nfrozen: {'1' * 40}", "frozen: input should be a valid string; got 111"),
         ("shared: []", "shared: [{method: a, run_of: ours, obstacles: 0}]", "unknown key; did you mean runs_of?"),
         ("shared: []", "shared: [{method: ours, runs_of: model_a, obstacles: 1}]", "which is not in the grid"),
+        ("shared: []", "shared: [{method: our, runs_of: ours, obstacles: 1}]", "shared.0.method: 'our' is not here;"),
+        ("shared: []", "shared: [{method: ours, runs_of: ours, obstacles: 7}]", "shared.0.obstacles: no setting of"),
     ],
 )  # fmt: skip
 def test_a_bad_grid_is_refused_by_key_and_reason(tmp_path: Path, old: str, new: str, reason: str) -> None:

@@ -45,7 +45,9 @@ def test_what_has_not_been_trained_again_is_said() -> None:
 
 @pytest.mark.parametrize(("before", "after"), [("former", "runs"), ("runs", "amended")])
 def test_a_committed_training_that_is_longer_goes_through_the_shorter_one(before: str, after: str) -> None:
-    curves = {path.relative_to(RESULTS / before): path.read_text() for path in (RESULTS / before).glob("*/*/*/progress.csv")}
+    curves = {
+        path.relative_to(RESULTS / before): path.read_text() for path in (RESULTS / before).glob("*/*/*/progress.csv")
+    }
     longer = {place: RESULTS / after / place for place in curves if (RESULTS / after / place).exists()}
     assert longer
     for place, path in longer.items():

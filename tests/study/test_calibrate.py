@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from made_up import rounds, write_run
 from tiny_runs import TINY, everything_in, train_in_this_process
 
 from marl_encircle.experiments import grid as grids
@@ -150,8 +151,9 @@ def test_the_distance_is_to_the_papers_cells(
     assert table[2] == "the paper,97.8800,23.5100,,"
     text = (tmp_path / "sensitivity.md").read_text()
     assert f"| centre | {ours.success:.2f} ({each:.1f}) / {ours.length:.2f} |" in text
+    write_run(tmp_path / "runs" / "centre", Cell("other", Setting(1.1, 3, 0)), protocol.seeds[0], rounds(0, 8))
     before = everything_in(tmp_path)
-    assert calibrate(one, tmp_path, 1) == result
+    assert calibrate(one, tmp_path, 1) == result, "whatever another method has there"
     assert everything_in(tmp_path) == before
     assert render(one, result)["sensitivity.md"] == (tmp_path / "sensitivity.md").read_text()
 

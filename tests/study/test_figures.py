@@ -31,14 +31,14 @@ from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import share_interval, summarise_cell
-from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.experiments.records import Cell, Setting, read_runs
 from marl_encircle.experiments.train import OtherRunError, run_folder, train, write_episodes
 from marl_encircle.replays.replay import Replay, record_round
 from marl_encircle.study.figures import canvas, curves, situations, write
 from marl_encircle.study.figures.canvas import encode, rgb
 from marl_encircle.study.figures.contributions import draw_figure5
 from marl_encircle.study.figures.curves import Band, band_of, draw_figure4
-from marl_encircle.study.figures.rounds import Choice, Column, choose_round, draw_figure6
+from marl_encircle.study.figures.rounds import PLACES, Choice, Column, choose_round, draw_figure6
 from marl_encircle.study.figures.situations import SITUATIONS, draw_figure1, draw_figure3, moment_of
 from marl_encircle.study.figures.write import encode_figures, write_figures
 
@@ -290,8 +290,13 @@ def test_the_round_drawn_is_the_median_of_those_that_needed_an_obstacle() -> Non
 
 
 def test_methods_and_pursuers_are_told_apart() -> None:
-    looks = [curves.series_of(method, ["idea", "plan"]) for method in (*curves.ALL_METHODS, "idea")]
+    methods = (*curves.PAPERS_METHODS, "ours_plus", "generalist", "idea")
+    looks = [curves.series_of(method, methods) for method in methods]
     assert len({look.dashes for look in looks}) == len({look.marker for look in looks}) == len(SERIES)
+    many = [*methods, *(f"idea_{i}" for i in range(9))]
+    papers = [curves.series_of(method, many) for method in curves.PAPERS_METHODS]
+    assert papers == looks[:5]
+    assert not {curves.series_of(method, many) for method in many[5:]} & set(papers)
 
 
 @pytest.fixture
@@ -304,6 +309,13 @@ def tiny_grid(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> grids.Grid:
 
     monkeypatch.setattr(grids, "load_config", tiny)
     return load_grid("smoke")
+
+
+def test_a_policy_of_one_obstacle_is_not_shown_in_a_scene_of_several(tmp_path: Path) -> None:
+    config = load_config(profile="smoke", overrides=[*TINY, "scenario.composite_unit=false"])
+    train(config, 0, "native", tmp_path)
+    concave = next(place for place in PLACES if place.setting.scene == "concave")
+    assert write._column(concave, read_runs(tmp_path), tmp_path) == Column("concave", None, note="several obstacles")
 
 
 def test_all_figures_are_written_and_the_same_runs_give_the_same_bytes(

@@ -26,6 +26,7 @@ from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.loading import load_policy
 from marl_encircle.experiments.records import Cell, Run, Setting, read_runs
 from marl_encircle.experiments.train import train
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.replay import Replay, record_round
 from marl_encircle.study.figures.curves import Band, band_of
 from marl_encircle.study.paper import label
@@ -339,6 +340,12 @@ def test_the_command_says_what_takes_its_time_and_prints_the_file(
     done = command(capsys, monkeypatch, "report", "--grid", "smoke", "--out", runs)
     assert (done.code, done.out) == (0, f"{runs / 'report.html'}\n")
     assert done.err == "playing the first rounds of every cell again, about a second each\n"
+
+
+def test_a_report_of_no_runs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"{tmp_path}/runs: no runs"):
+        write_report(None, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_grid_and_runs_of_the_usual_one_all_runs_are_shown(

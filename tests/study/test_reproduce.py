@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch as th
 from made_up import markdown_row
+from safetensors.torch import load_file, save_file
 from tiny_runs import IN_SEVERAL_SETTINGS, TINY, everything_in, train_in_this_process
 
 from marl_encircle import files
@@ -248,6 +250,9 @@ def test_a_diverged_run_is_shown_and_not_evaluated(tmp_path: Path, monkeypatch: 
     path = folders(tmp_path)[0] / "run.json"
     record = json.loads(path.read_text())
     del record["sha256"]["episodes.csv"]
+    weights = path.with_name("policy.safetensors")
+    save_file({name: th.full_like(weight, th.nan) for name, weight in load_file(weights).items()}, weights)
+    record["sha256"][weights.name] = files.sha256_bytes(weights.read_bytes())
     files.write_json(path, {**record, "status": "diverged"})
     (path.parent / "episodes.csv").unlink()
     monkeypatch.setattr(reproduction, "play_rounds", lambda *_: pytest.fail("it was evaluated"))

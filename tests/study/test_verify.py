@@ -50,6 +50,11 @@ def test_what_was_recorded_here_is_played_again_to_the_last_bit(results: Path) -
     assert everything_in(results) == before
 
 
+def test_a_run_that_was_stopped_before_its_record_was_written_is_passed_over(results: Path) -> None:
+    run_folder(GRID.jobs[0].config, 0, results / "runs").joinpath("run.json").unlink()
+    assert verify(GRID, results).rounds == 0
+
+
 def test_compressed_rounds_are_played_again_too(results: Path) -> None:
     compress(run_folder(GRID.jobs[0].config, 0, results / "runs") / "episodes.csv")
     assert verify(GRID, results) == Verification(rounds=8, equal=8, cells_off=0, exact=True, changed=())

@@ -1,6 +1,6 @@
 """Figure 4: success over training, from the learning curves of runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,15 +14,15 @@ from marl_encircle.experiments.learning_curve import Curve
 from marl_encircle.experiments.metrics import share_interval
 from marl_encircle.experiments.records import Cell, Setting
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
-from marl_encircle.study.paper import label
+from marl_encircle.study.paper import label, rank
 
 Array = NDArray[np.float64]
 
 FIGURE4_METHODS = ("ours", "model_b", "ma2019")
 """What the paper compares."""
 
-ALL_METHODS = ("ours", "model_b", "ma2019", "model_a", "model_c")
-"""In the order of ``SERIES``; others come after them by name."""
+PAPERS_METHODS = ("ours", "model_b", "ma2019", "model_a", "model_c")
+"""In the order of ``SERIES``; what is left of these is for all others in turn."""
 
 SETTINGS = (Setting(1.1, 3, 0), Setting(1.1, 3, 1))
 
@@ -67,12 +67,20 @@ def band_of(curves: Sequence[Curve], rounds: int) -> Band:
 
 
 def series_of(method: str, methods: Sequence[str] = ()) -> Series:
-    """Return how a method's curve looks: the same in every figure.
+    """Return how a method's curve looks: those of the paper's methods are the same in every figure, and nobody else's.
 
     :param methods: all methods of the figure, which give those that the paper lacks their places
     """
-    order = [*ALL_METHODS, *sorted(set(methods) - set(ALL_METHODS))]
-    return SERIES[order.index(method) % len(SERIES)]
+    if method in PAPERS_METHODS:
+        return SERIES[PAPERS_METHODS.index(method)]
+    left = SERIES[len(PAPERS_METHODS) :]
+    return left[in_order({method, *methods} - set(PAPERS_METHODS)).index(method) % len(left)]
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Sort methods by their importance: the paper's, then what goes beyond, then others by name."""
+    papers = {method: place for place, method in enumerate(PAPERS_METHODS)}
+    return sorted(methods, key=lambda method: (papers.get(method, len(papers)), rank(method)))
 
 
 @style()

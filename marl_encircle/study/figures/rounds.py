@@ -97,7 +97,7 @@ def _needed_obstacle(episode: Episode, closure: Closure) -> bool:
 def draw_figure6(columns: Sequence[Column]) -> Figure:
     """Draw trajectories above, the enclosures that they end in below.
 
-    :param columns: with solved rounds
+    :param columns: one of each place, with a round or with what stands in its place
     """
     figure = Figure((WIDTH, 4.1))
     grid = figure.subplots(2, len(columns), squeeze=False)
@@ -126,9 +126,10 @@ def _in_words(column: Column) -> str:
     choice, replay = column.choice, column.replay
     if choice is None or replay is None:
         return column.note
+    rounds = f"{choice.with_obstacle} of {choice.solved} solved rounds\nneeded the obstacle"
     if replay.scenario.obstacles == 0:
-        return f"{choice.solved} of {choice.played} rounds solved"
-    return f"{choice.with_obstacle} of {choice.solved} solved rounds\nneeded the obstacle\n{column.note}".rstrip()
+        rounds = f"{choice.solved} of {choice.played} rounds solved"
+    return f"{rounds}\n{column.note}".rstrip()
 
 
 def _draw_trajectories(axes: Axes, replay: Replay, step: int) -> None:

@@ -1,6 +1,7 @@
 """From the runs of a grid to the files of all figures."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ from marl_encircle.replays.replay import record_round
 from marl_encircle.study.figures import contributions, curves
 from marl_encircle.study.figures.canvas import encode
 from marl_encircle.study.figures.contributions import draw_figure5
-from marl_encircle.study.figures.curves import ALL_METHODS, Band, band_of, draw_figure4
+from marl_encircle.study.figures.curves import Band, band_of, draw_figure4, in_order
 from marl_encircle.study.figures.rounds import METHOD, PLACES, Column, Place, choose_round, draw_figure6
 from marl_encircle.study.figures.situations import draw_figure1, draw_figure3
 
@@ -53,12 +54,11 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     runs = runs_of(grid, folder)
     bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
     methods = {cell.method for cell in grid.cells if cell.setting in curves.SETTINGS}
-    others = sorted(methods - set(ALL_METHODS))
     return {
         "figure1": draw_figure1(),
         "figure3": draw_figure3(),
         "figure4": draw_figure4(bands, aliases=grid.aliases),
-        "figure4_all": draw_figure4(bands, [*(m for m in ALL_METHODS if m in methods), *others], grid.aliases),
+        "figure4_all": draw_figure4(bands, in_order(methods), grid.aliases),
         "figure5": draw_figure5(_summaries(runs)),
         "figure6": draw_figure6([_column(place, runs, folder) for place in PLACES]),
     }
@@ -102,7 +102,7 @@ def _summaries(runs: Sequence[Run]) -> Mapping[Cell, CellSummary]:
 
 
 def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
-    """Replay the round of a place: of the first training seed, chosen by rule.
+    """Replay the round of a place: of the first finished training seed, chosen by rule.
 
     Where no policy was trained in a scene, that of single discs is put there as it is.
     """
@@ -112,17 +112,19 @@ def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
         return Column(place.title, None, note="not run")
     run = found[0]
     policy, config, _ = load_run(folder / run_path(run.cell, run.seed))
-    rounds, evaluation, scene, note = run.episodes, config.evaluation, place.setting.scene, ""
+    rounds, evaluation, scene, notes = run.episodes, config.evaluation, place.setting.scene, []
     if run.cell.setting.scene != scene:
+        if replace(config.scenario, scene=scene).units != config.scenario.units:
+            return Column(place.title, None, note="several obstacles")
         rounds = run.elsewhere.get(place.setting) or tuple(
             play_rounds(policy, config, evaluation.episodes, evaluation.seed, place.setting)
         )
-        note = "(trained with discs)"
+        notes.append("(trained with discs)")
     choice = choose_round(rounds, config.reward.closure)
     if choice is None:
         return Column(place.title, None, note="no round solved")
     replay = record_round(policy, config, choice.round, evaluation.seed, scene)
     recorded = rounds[choice.round].success_step(config.reward.closure)
     if replay.success_step != recorded:  # evaluated on a processor that rounds otherwise
-        note = f"(step {recorded} when evaluated)"
-    return Column(place.title, replay, choice, note)
+        notes.append(f"(step {recorded} when evaluated)")
+    return Column(place.title, replay, choice, "\n".join(notes))

@@ -26,7 +26,7 @@ def write_report(grid: Grid | None, results: str | Path) -> Path:
     :param grid: whose runs; what it asks for and is not there, is "not run". None: all runs there are
     :return: the file
     :raises ConfigError: if a run has another configuration than the grid asks for or, without one, than the others of
-        its cell, with the difference
+        its cell, with the difference; without a grid also if there are no runs
     :raises DamagedFileError: if a run there is not what its record says
     """
     path = Path(results) / "report.html"
@@ -39,7 +39,7 @@ def report(grid: Grid | None, folder: Path) -> str:
 
     :param folder: of all runs
     """
-    shown = _of_grid(grid, folder) if grid else _of_all(folder)
+    shown = _of_grid(grid, folder) if grid is not None else _of_all(folder)
     runs, cells, aliases, notes = shown.runs, shown.cells, shown.aliases, shown.notes
     options = {method: options_of(method) for method in TABLE1_METHODS}
     *tables, differences = main_tables(runs, aliases, cells, notes)
@@ -73,6 +73,8 @@ def _of_grid(grid: Grid, folder: Path) -> _Shown:
 def _of_all(folder: Path) -> _Shown:
     """Gather every run there is; raise a ConfigError for two of one cell that were not trained alike."""
     runs = read_runs(folder)
+    if not runs:
+        raise ConfigError(f"{folder}: no runs")
     first: dict[Cell, Path] = {}
     for run in runs:
         if run.status != "unfinished":
