@@ -16,8 +16,9 @@ from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.grid import Grid, Job, arguments
 from marl_encircle.experiments.metrics import RunSummary, summarise_run
-from marl_encircle.experiments.pretrained import in_words
+from marl_encircle.experiments.pretrained import first_run, in_words, pretrained_runs
 from marl_encircle.experiments.records import POLICY, Cell, Run, Setting, read_record, run_path
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.paper import label
 
 CARD = "README.md"
@@ -88,7 +89,7 @@ trained by marl-encircle with {config.algorithm.name.upper()}.
 ## Play a round
 
 ```python
-{_program(config)}
+{_program(config, _comes_with_the_package(record))}
 ```
 
 ## The command that made it
@@ -131,16 +132,29 @@ def _trained_in(config: Config) -> dict[str, str]:
     return {"trained in": "; ".join(texts)}
 
 
-def _program(config: Config) -> str:
-    """Return the Python that plays a round of the policy in its own world."""
+def _comes_with_the_package(record: Mapping[str, Any]) -> bool:
+    """Whether the name of the method stands for this policy."""
+    try:
+        run = first_run(Config.from_dict(record["config"]).cell, [pretrained_runs()])
+    except ConfigError:  # it diverged there
+        return False
+    return run is not None and read_record(run)["sha256"].get(POLICY) == record["sha256"][POLICY]
+
+
+def _program(config: Config, has_name: bool) -> str:
+    """Return the Python that plays a round of the policy in its own world.
+
+    :param has_name: whether the policy is loaded by its name, else by its file in the card's folder
+    """
     setting = [f"{name}={_literal(value)}" for name, value in config.cell.setting._asdict().items()]
     rules = ", ".join([*setting, *_rules(config.scenario)])
     closure = config.reward.closure
+    policy = ", ".join([_literal(config.reward.name), *setting]) if has_name else _literal(POLICY)
     reward = "" if closure == Reward().closure else f", Reward(closure={_literal(closure)})"
     return f"""\
 from marl_encircle import {"Reward, " if reward else ""}Scenario, load_policy, parallel_env
 
-policy = load_policy({", ".join([_literal(config.reward.name), *setting])})
+policy = load_policy({policy}){"" if has_name else "  # in this folder"}
 env = parallel_env(Scenario({rules}){reward})
 observations, _ = env.reset(seed=7000)
 while env.agents:

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch as th
 from made_up import rounds
+from safetensors.torch import load_file
 from tiny_runs import TINY, command, copy_of_finished, finished, tiny
 
 from marl_encircle.experiments.grid import Grid, Job, load_grid
@@ -85,6 +87,18 @@ def test_the_program_on_a_card_plays_a_round(capsys: pytest.CaptureFixture[str],
     path = find_run(method, USUAL_SETTING, [RUNS]) / CARD
     exec(code(path.read_text(), "python"), {})
     assert capsys.readouterr().out in ("True\n", "False\n")
+
+
+def test_the_program_on_the_card_of_another_folder_plays_that_policy(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(copy_of_finished(tmp_path))
+    played: dict[str, Any] = {}
+    exec(code(card(), "python"), played)
+    assert capsys.readouterr().out in ("True\n", "False\n")
+    weights = load_file("policy.safetensors")
+    actor = played["policy"].actor.state_dict()
+    assert all(th.equal(actor[name], weight) for name, weight in weights.items())
 
 
 def test_only_the_first_seed_has_a_card_and_only_when_it_is_finished(tmp_path: Path) -> None:
