@@ -17,12 +17,12 @@ _INTERVAL_NOTE = (
 )
 _BOLD_NOTE = (
     "Bold: an S whose paired difference (same training seeds and rounds) to each of the paper's other methods with a"
-    " result there has a 95 % interval above zero. These intervals are not corrected for the number of comparisons. MEL"
+    " number there has a 95 % interval above zero. These intervals are not corrected for the number of comparisons. MEL"
     " is never bold; table_differences compares it."
 )
 _IMPOSSIBLE_NOTE = (
     f"{DASH}: the method has to enclose the target with the pursuers alone, who are too few there (Eq. 6). In brackets:"
-    " the S that was measured. Such a cell is not compared with others."
+    " the S that was measured."
 )
 _PAPERS_DASH_NOTE: Text = (
     f"{DASH} in the rows ",

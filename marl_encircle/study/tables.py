@@ -7,6 +7,7 @@ layout; CSV has one line for each cell, with all numbers.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from marl_encircle.core.geometry import Closure
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of, with_settings_elsewhere
 from marl_encircle.study.differences import difference_table, render_differences
@@ -37,10 +38,7 @@ _CELL_NOTE: Text = (
     ": S / MEL as the paper reports them.",
 )
 _COMMON_CELL_NOTE = "Cells: S [95 % interval] / MEL of this study; the paper has no such table."
-_OWN_RULE_NOTE = (
-    "S: share of the evaluation rounds that end enclosed, in %, each method under its own closure rule (Ma and Model A:"
-    " pursuers alone; Models B and C and Ours: pursuers and obstacles)."
-)
+_RULES: dict[Closure, str] = {"pursuers": "pursuers alone", "all": "pursuers and obstacles"}
 _COMMON_RULE_NOTE = (
     "S: share of the evaluation rounds in which pursuers and obstacles together enclose the target, in %. Ma and Model"
     " A are trained to enclose it with the pursuers alone."
@@ -186,7 +184,7 @@ def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, Paper
     """One of Tables 2-4, each method under its own closure rule."""
     layout = LAYOUTS[name]
     header, rows, behind = wide(layout, results, paper)
-    notes = [_CELL_NOTE, _OWN_RULE_NOTE, *notes_on(results, paper, columns_compete=True), *behind, *more]
+    notes = [_CELL_NOTE, _own_rule_note(results), *notes_on(results, paper, columns_compete=True), *behind, *more]
     return Table(name, layout.title, header, rows, notes)
 
 
@@ -224,8 +222,19 @@ def _other_table(results: Sequence[Result], more: Sequence[str]) -> Table:
         ]
         for result in results
     ]
-    notes = [_OWN_RULE_NOTE, *notes_on(results), *more]
+    notes = [_own_rule_note(results), *notes_on(results), *more]
     return Table("table_other", _OTHER, _OTHER_HEADER, rows, notes)
+
+
+def _own_rule_note(results: Sequence[Result]) -> str:
+    """Say what S is, and whose rule is which."""
+    methods = {
+        rule: list(dict.fromkeys(label(result.cell.method) for result in results if result.closure == closure))
+        for closure, rule in _RULES.items()
+    }
+    whose = "; ".join(f"{rule}: {' and '.join(names)}" for rule, names in methods.items() if names)
+    rules = f" ({whose})" if whose else ""
+    return f"S: share of the evaluation rounds that end enclosed, in %, each method under its own closure rule{rules}."
 
 
 def _owner(result: Result) -> str | None:
