@@ -294,7 +294,7 @@ def test_the_page_decodes_what_was_packed(opened: Opened) -> None:
           const data = JSON.parse(document.getElementById("rounds").textContent);
           return data.cells.map((cell) => {
             if (!cell.rounds.length) return null;
-            const { world } = data.settings[cell.setting], round = decodeRound(cell.rounds[1], world, data.units);
+            const { world } = cell, round = decodeRound(cell.rounds[1], world, data.units);
             const reach = (moment) => moment.reach.map((value) => (Number.isFinite(value) ? value : -1));
             const moments = round.moments.map((moment) => ({ ...moment, reach: reach(moment) }));
             return { round: cell.rounds[1], world, units: data.units, discs: round.discs, moments };

@@ -192,8 +192,9 @@ def test_what_is_embedded_is_the_replay_within_its_steps(scenario: dict[str, Any
     for number in range(16):
         replay = played(number, **scenario)
         data = json.loads(json.dumps(player_of(replay)))
-        [setting], [[shown]] = data["settings"], [cell["rounds"] for cell in data["cells"]]
-        found, t = unpacked(shown, setting["world"], data["units"]), shown["moments"]
+        [cell] = data["cells"]
+        [shown] = cell["rounds"]
+        found, t = unpacked(shown, cell["world"], data["units"]), shown["moments"]
         enclosure = replay.enclosure["all"]
         for key, unit in (("pursuers", 1e-4), ("target", 1e-4), ("velocities", 1e-2)):
             np.testing.assert_allclose(found[key], getattr(replay, key)[:t], rtol=0, atol=0.5001 * unit)
@@ -208,6 +209,16 @@ def test_what_is_embedded_is_the_replay_within_its_steps(scenario: dict[str, Any
         np.testing.assert_array_equal(found["state"], closed.astype(int) + enclosure.complete[:t])
         states |= set(found["state"].tolist())
     assert seen <= states, "else little was compared"
+
+
+def test_every_cell_has_the_world_of_its_own_policy() -> None:
+    tunnel = Setting(1.1, 3, 1, "tunnel")
+    rounds = {"ours": played(scene="tunnel"), "model_b": played(scene="tunnel", composite_unit=False)}
+    cells = [
+        ShownCell(Cell(method, tunnel), "run", 0, rounds=[Played(replay, replay.success_step)])
+        for method, replay in rounds.items()
+    ]
+    assert [cell["world"]["entities"] for cell in player_data(cells)["cells"]] == [3 + 1, 3 + 10]
 
 
 def test_a_round_ends_with_its_own_success_or_with_its_time() -> None:
@@ -250,7 +261,7 @@ def test_what_is_shown_first_is_ours_where_one_obstacle_has_to_help_few_pursuers
     data = player_data([*shown, ShownCell(Cell("ours", Setting(1.1, 1, 1)), "not run")])
     first = data["start"]
     assert data["methods"][first["method"]] == "Ours"
-    assert data["settings"][first["setting"]]["label"] == "2 pursuers, 1 obstacle, λ = 1.1"
+    assert data["settings"][first["setting"]] == "2 pursuers, 1 obstacle, λ = 1.1"
 
 
 @pytest.mark.usefixtures("_tiny_grid")
@@ -268,7 +279,7 @@ def test_missing_runs_are_shown_as_not_run(runs: Path, tmp_path: Path) -> None:
     assert "0 of 2 finished" in Parsed(nothing).words
     assert "Not run: 3 pursuers, 1 obstacle, λ = 1.1." in Parsed(nothing).words
     assert {cell["status"] for cell in data_in(nothing)["cells"]} == {"not run"}
-    assert data_in(nothing)["settings"][0]["world"] is None
+    assert data_in(nothing)["cells"][0]["world"] is None
 
 
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "a&amp;b", "{{data}}"])

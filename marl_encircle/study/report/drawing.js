@@ -13,7 +13,7 @@ function readColours() {
  * Draw a moment.
  *
  * @param canvas as large as it is laid out
- * @param world what all rounds of the setting have in common
+ * @param world what all rounds of the policy have in common
  * @param round a decoded round
  * @param step the moment's number
  * @param show what to lay over: circles, ring, area, trails, closeUp

@@ -24,7 +24,7 @@ function startPlayer(data) {
 
   function decode(cell, index) {
     const round = roundsOf(cell)[index];
-    if (!decoded.has(round)) decoded.set(round, decodeRound(round, data.settings[cell.setting].world, data.units));
+    if (!decoded.has(round)) decoded.set(round, decodeRound(round, policyOf(cell).world, data.units));
     return decoded.get(round);
   }
 
@@ -52,12 +52,14 @@ function startPlayer(data) {
       return { value, text: disabled ? `${text} (${cell?.status ?? "not asked for"})` : text, disabled };
     });
     fill(parts.method, entries, parts.method.value);
-    const others = entries.filter((entry) => entry.value !== number(parts.method));
-    fill(parts.other, [{ value: -1, text: "nobody" }, ...others], parts.other.value || -1);
     const rounds = roundsOf(cellAt(number(parts.method), setting)).map((round, value) => {
       return { value, text: `${round.number}: ${round.success === null ? "not enclosed" : `${round.success} steps`}` };
     });
     fill(parts.round, rounds, parts.round.value);
+    const others = entries
+      .filter((entry) => entry.value !== number(parts.method))
+      .map((entry) => ({ ...entry, disabled: roundsOf(cellAt(entry.value, setting)).length <= number(parts.round) }));
+    fill(parts.other, [{ value: -1, text: "nobody" }, ...others], parts.other.value || -1);
   }
 
   /** Show what is chosen, from its end: the moment that decides. */
@@ -74,7 +76,7 @@ function startPlayer(data) {
   }
 
   function makeView(cell, index) {
-    const world = data.settings[cell.setting].world;
+    const { world } = policyOf(cell);
     const round = decode(cell, index);
     const copy = (name) => document.getElementById(name).content.firstElementChild.cloneNode(true);
     const [figure, panel] = [copy("view"), copy("panel")];
@@ -222,7 +224,7 @@ function startPlayer(data) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => show(state.step));
   new ResizeObserver(() => show(state.step)).observe(parts.stage);
 
-  const settings = data.settings.map(({ label: text }, value) => {
+  const settings = data.settings.map((text, value) => {
     const disabled = !data.cells.some((cell) => cell.setting === value && roundsOf(cell).length);
     return { value, text: disabled ? `${text} (not run)` : text, disabled };
   });

@@ -114,10 +114,7 @@ def player_data(cells: Sequence[ShownCell]) -> dict[str, Any]:
         "start": _start(cells, methods, settings),
         "units": {"position": POSITION, "velocity": VELOCITY, "reach": REACH, "angle": ANGLE, "area": AREA},
         "methods": [label(method) for method in methods],
-        "settings": [
-            {"label": in_words(setting), "world": _world(setting, [c for c in cells if c.cell.setting == setting])}
-            for setting in settings
-        ],
+        "settings": [in_words(setting) for setting in settings],
         "cells": [
             {
                 "method": methods.index(each.cell.method),
@@ -126,6 +123,7 @@ def player_data(cells: Sequence[ShownCell]) -> dict[str, Any]:
                 "runsOf": methods.index(each.runs_of) if each.runs_of is not None else None,
                 "seed": each.seed,
                 "closure": each.rounds[0].replay.closure if each.rounds else None,
+                "world": _world(each.rounds[0].replay) if each.rounds else None,
                 "rounds": [_round(played) for played in each.rounds],
             }
             for each in cells
@@ -150,19 +148,15 @@ def in_words(setting: Setting) -> str:
     return f"{n} pursuer{'' if n == 1 else 's'}, {obstacles}, λ = {setting.speed_ratio:g}"
 
 
-def _world(setting: Setting, cells: Sequence[ShownCell]) -> dict[str, Any] | None:
-    """Return what all rounds of a setting have in common; None if there are none."""
-    replay = next((played.replay for each in cells for played in each.rounds), None)
-    if replay is None:
-        return None
+def _world(replay: Replay) -> dict[str, Any]:
+    """Return what all rounds of a cell have in common."""
     scenario = replay.scenario
     # The arc of a pursuer at (1, 0): that of any other is it, turned and scaled.
-    angles, distances = facing_arc(np.array([1.0, 0.0]), setting.speed_ratio)
+    angles, distances = facing_arc(np.array([1.0, 0.0]), scenario.speed_ratio)
     return {
         "pursuers": scenario.pursuers,
         "entities": scenario.pursuers + scenario.units,
         "discs": len(replay.discs),
-        "directions": scenario.n_directions,
         "colours": len(PURSUERS),
         "halfWidth": scenario.half_width,
         "pursuerRadius": scenario.pursuer_radius,
