@@ -99,19 +99,18 @@ def render_agreement(
     gaps = gaps_of(runs, paper)
     if not gaps:
         return {}
-    calibrated = {gap.cell for gap in gaps if _trained_as(gap.cell, runs) in calibrated}
-    numbers = numbers_table(gaps, calibrated)
-    order = order_table(pairs_of(runs, paper))
+    chosen_by = {gap.cell for gap in gaps if _trained_as(gap.cell, runs) in calibrated}
+    numbers = numbers_table(gaps, chosen_by)
     sections = (
         "# How near the study comes to the paper\n",
-        markdown(numbers.title, numbers.header, numbers.rows, [*numbers.notes, *notes], level=2),
-        markdown(order.title, order.header, order.rows, order.notes, level=2),
+        markdown(numbers._replace(notes=[*numbers.notes, *notes]), level=2),
+        markdown(order_table(pairs_of(runs, paper)), level=2),
     )
     records = [
         {
             "method": gap.cell.method,
             **setting_columns(gap.cell.setting),
-            "cell": "calibrated on" if gap.cell in calibrated else "held out",
+            "cell": "calibrated on" if gap.cell in chosen_by else "held out",
             "success_percent_difference": f"{gap.success:.4f}",
             "mean_episode_length_difference": "" if gap.length is None else f"{gap.length:.4f}",
         }

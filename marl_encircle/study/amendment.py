@@ -5,10 +5,10 @@ from collections.abc import Iterable, Mapping
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import CellRuns, Result, gather, result_of
 from marl_encircle.study.differences import paired_success
-from marl_encircle.study.paper import label, rank
+from marl_encircle.study.paper import by_method, label
 from marl_encircle.study.paper_layout import notes_on, success_and_length
 from marl_encircle.study.tables import record_of
-from marl_encircle.study.typeset import Text, markdown, to_csv, with_interval
+from marl_encircle.study.typeset import Table, Text, markdown, to_csv, with_interval
 
 AMENDMENT_TABLES = ("table_amendment.md", "table_amendment.csv")
 
@@ -35,7 +35,7 @@ def render_amendment(
     before = gather(former, {})
     if not before:
         return {}
-    cells = sorted(before, key=lambda cell: (rank(cell.method), cell))
+    cells = by_method(before)
     pairs = [(result_of(cell, before[cell]), result_of(cell, runs.get(cell))) for cell in cells]
     results = [result for pair in pairs for result in pair]
     records = [
@@ -43,11 +43,9 @@ def render_amendment(
         for pair in pairs
         for when, result in zip(("before", "after"), pair, strict=True)
     ]
-    texts = (
-        markdown(_TITLE, _HEADER, [_row(*pair) for pair in pairs], [*_NOTES, *notes_on(results), *notes]),
-        to_csv(records),
-    )
-    return dict(zip(AMENDMENT_TABLES, texts, strict=True))
+    rows = [_row(*pair) for pair in pairs]
+    table = Table("table_amendment", _TITLE, _HEADER, rows, [*_NOTES, *notes_on(results), *notes])
+    return dict(zip(AMENDMENT_TABLES, (markdown(table), to_csv(records)), strict=True))
 
 
 def _row(before: Result, after: Result) -> list[Text]:

@@ -22,7 +22,7 @@ from marl_encircle.experiments.records import read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.trainable import check_trainings
 from marl_encircle.study.protocol import Changes, Protocol, SuccessAndLength, cells_with_numbers, jobs_of, name_of
-from marl_encircle.study.typeset import Text, markdown
+from marl_encircle.study.typeset import Table, Text, markdown
 
 
 class CalibrationError(Exception):
@@ -125,7 +125,7 @@ def render(protocol: Protocol, calibration: Calibration) -> dict[str, str]:
         writer.writerow([name_of(trial.changes), *values, f"{trial.distance:.2f}"])
     writer.writerow(["the paper", *(value for s, mel in paper for value in (f"{s:.4f}", f"{mel:.4f}", "")), ""])
     return {
-        "sensitivity.md": markdown("Calibration: what success depends on", header, rows, notes),
+        "sensitivity.md": markdown(Table("sensitivity", "Calibration: what success depends on", header, rows, notes)),
         "sensitivity.csv": table.getvalue(),
         "scenario.yaml": "".join(f"{key}: {value}\n" for key, value in {"base": protocol.scenario, **chosen}.items()),
     }

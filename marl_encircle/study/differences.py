@@ -22,10 +22,17 @@ _NOTES = [
 ]
 
 
+_NOT_RUN = "not run"
+
+
 class _Row(NamedTuple):
-    """Ours minus another method in one setting, or why there is nothing to compare."""
+    """Ours minus another method in one setting, or why there is nothing to compare.
+
+    :param own_rules: whether each method is under its own closure rule; only then there is a sigma_c
+    """
 
     cell: Cell
+    own_rules: bool
     closure_ours: Closure | None
     closure_other: Closure | None
     success: Difference | None
@@ -41,17 +48,24 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
     :param notes: further ones
     :return: ``table_differences.md`` and ``.csv`` -> text
     """
-    cells = list(cells)
-    table = difference_table(cells, runs, notes)
+    rows = _all_rows(cells, runs)
+    table = _table(rows, notes)
     return {
-        "table_differences.md": markdown(table.title, table.header, table.rows, table.notes),
-        "table_differences.csv": to_csv([_record(row) for row in _all_rows(cells, runs)]),
+        "table_differences.md": markdown(table),
+        "table_differences.csv": to_csv([_record(row) for row in rows]),
     }
 
 
 def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
-    """Return the paired differences of Ours to every other method as a table; see :func:`render_differences`."""
+    """Return as a table the rows of :func:`render_differences` in which both methods have runs; others are counted."""
     rows = _all_rows(cells, runs)
+    there = [row for row in rows if row.nothing != _NOT_RUN]
+    missing = len(rows) - len(there)
+    left_out = [f"Rows left out in which one of the two is not run: {missing}."] if missing else []
+    return _table(there, [*notes, *left_out])
+
+
+def _table(rows: Sequence[_Row], notes: Sequence[str]) -> Table:
     shown = [_shown(row) for row in rows]
     return Table("table_differences", "Ours minus the others", _HEADER, shown, [*_NOTES, _corrected(rows), *notes])
 
@@ -87,7 +101,7 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
     ours, other = runs.get(Cell("ours", cell.setting)), runs.get(cell)
     nothing = nothing_to_compare(ours, other)
     if nothing is not None or ours is None or other is None or ours.closure is None or other.closure is None:
-        yield _Row(cell, None, None, None, None, None, nothing)
+        yield _Row(cell, True, None, None, None, None, None, nothing)
         return
     sigma = metrics.sigma_difference(ours.finished, other.finished)
     rules: list[tuple[Closure, Closure]] = [(ours.closure, other.closure)]
@@ -96,7 +110,8 @@ def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
     for closures in rules:
         success = metrics.success_difference(ours.finished, other.finished, *closures)
         length = metrics.length_difference(ours.finished, other.finished, *closures)
-        yield _Row(cell, *closures, success, length, sigma if closures == rules[0] else None, None)
+        own = closures == rules[0]
+        yield _Row(cell, own, *closures, success, length, sigma if own else None, None)
 
 
 def paired_success(first: Result, second: Result) -> Difference | None:
@@ -111,7 +126,7 @@ def paired_success(first: Result, second: Result) -> Difference | None:
 def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:
     """Why two cells cannot be compared; None if they can."""
     if first is None or second is None:
-        return "not run"
+        return _NOT_RUN
     if not first.finished or not second.finished:
         return "no finished run"
     if first.finished is second.finished:
@@ -145,7 +160,7 @@ def _with_verdict(difference: Difference, scale: float, form: str = "+.2f") -> s
 
 def _corrected(rows: Iterable[_Row]) -> str:
     """Name the differences in S that are shown if all comparisons under the methods' own rules are taken together."""
-    compared = [(row, p) for row in rows if row.sigma and row.success and (p := row.success.p_value) is not None]
+    compared = [(row, p) for row in rows if row.own_rules and row.success and (p := row.success.p_value) is not None]
     rejected = metrics.holm([p for _, p in compared])
     shown: dict[str, list[str]] = {}
     for (row, _), is_shown in zip(compared, rejected, strict=True):

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterable
 from importlib import resources
 from typing import NamedTuple
 
@@ -50,6 +51,11 @@ def reported_cells() -> dict[Cell, PaperResult]:
 def label(method: str) -> str:
     """Name of a method as the paper writes it; others keep their own."""
     return LABELS.get(method, method)
+
+
+def by_method(cells: Iterable[Cell]) -> list[Cell]:
+    """Sort cells by the rank of their method, then by setting."""
+    return sorted(cells, key=lambda cell: (rank(cell.method), cell))
 
 
 def rank(method: str) -> tuple[int, str]:

@@ -4,10 +4,10 @@ from collections.abc import Iterable, Sequence
 
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import gather, result_of, run_elsewhere
-from marl_encircle.study.paper import label, rank
+from marl_encircle.study.paper import by_method, label
 from marl_encircle.study.paper_layout import notes_on, success_and_length
 from marl_encircle.study.tables import record_of
-from marl_encircle.study.typeset import Text, markdown, to_csv
+from marl_encircle.study.typeset import Table, Text, markdown, to_csv
 
 SCENE_TABLES = ("table_scenes.md", "table_scenes.csv")
 
@@ -35,12 +35,13 @@ def render_scenes(runs: Iterable[Run], notes: Sequence[str] = ()) -> dict[str, s
     trained = {run.cell for run in played if run.elsewhere}
     scenes = dict.fromkeys(run.cell.setting.scene for run in played)
     rows: list[list[Text]] = []
-    for method, setting in sorted(trained, key=lambda cell: (rank(cell.method), cell)):
+    for method, setting in by_method(trained):
         cells = [Cell(method, setting._replace(scene=scene)) for scene in scenes]
         shown = [success_and_length(results[cell]) if cell in results else "" for cell in cells]
         rows.append([label(method), *setting.numbers, *shown])
+    header, more = ["Method", "λ", "n", "m", *scenes], [*_NOTES, *notes_on(results.values()), *notes]
     texts = (
-        markdown(_TITLE, ["Method", "λ", "n", "m", *scenes], rows, [*_NOTES, *notes_on(results.values()), *notes]),
+        markdown(Table("table_scenes", _TITLE, header, rows, more)),
         to_csv([record_of(result, None) for result in results.values()]),
     )
     return dict(zip(SCENE_TABLES, texts, strict=True))

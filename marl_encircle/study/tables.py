@@ -11,7 +11,7 @@ from marl_encircle.core.geometry import Closure
 from marl_encircle.experiments.records import Cell, Run
 from marl_encircle.study.cells import OTHER_STATUSES, CellRuns, Result, gather, result_of, with_settings_elsewhere
 from marl_encircle.study.differences import difference_table, render_differences
-from marl_encircle.study.paper import PaperResult, label, paper_results, rank, reported_cells
+from marl_encircle.study.paper import PaperResult, by_method, label, paper_results, reported_cells
 from marl_encircle.study.paper_layout import LAYOUTS, notes_on, seeds_of, success_and_length, wide
 from marl_encircle.study.typeset import (
     DASH,
@@ -83,7 +83,7 @@ def render_tables(
     rendered |= _common_table(shown.cells, shown.runs, shown.paper, notes)
     if shown.other:
         other = _other_table(shown.other, notes)
-        rendered["table_other.md"] = markdown(other.title, other.header, other.rows, other.notes)
+        rendered["table_other.md"] = markdown(other)
         rendered["table_other.csv"] = to_csv([record_of(result, None) for result in shown.other])
     return rendered | render_differences(shown.cells, shown.runs, notes)
 
@@ -146,17 +146,13 @@ def _gather(runs: Iterable[Run], aliases: Mapping[Cell, Cell], asked: Iterable[C
     main = {
         name: [result_of(cell, by_cell.get(cell)) for cell in _ordered(table, cells)] for name, table in paper.items()
     }
-    other = [result_of(cell, by_cell[cell]) for cell in _by_method(by_cell.keys() - set(cells))]
+    other = [result_of(cell, by_cell[cell]) for cell in by_method(by_cell.keys() - set(cells))]
     return _Shown(by_cell, paper, cells, main, other)
 
 
 def _texts(table: Table) -> dict[str, str]:
     """Write one of the paper's tables in Markdown and LaTeX."""
-    title = f"Table {table.name.removeprefix('table')}: {table.title}"
-    return {
-        f"{table.name}.md": markdown(title, table.header, table.rows, table.notes),
-        f"{table.name}.tex": latex(table.name, table.title, table.header, table.rows, table.notes),
-    }
+    return {f"{table.name}.md": markdown(table), f"{table.name}.tex": latex(table)}
 
 
 def freeze_notes(frozen: str | None, amended: str | None = None) -> list[str]:
@@ -172,12 +168,7 @@ def _ordered(paper: Iterable[Cell], others: Iterable[Cell]) -> list[Cell]:
     """Sort the paper's cells and the other ones that are in the same settings."""
     paper = set(paper)
     settings = {cell.setting for cell in paper}
-    return _by_method(paper | {cell for cell in others if cell.setting in settings})
-
-
-def _by_method(cells: Iterable[Cell]) -> list[Cell]:
-    """Sort cells by method, the paper's first, then by setting."""
-    return sorted(cells, key=lambda cell: (rank(cell.method), cell))
+    return by_method(paper | {cell for cell in others if cell.setting in settings})
 
 
 def _main_table(name: str, results: Sequence[Result], paper: Mapping[Cell, PaperResult], more: Sequence[str]) -> Table:
@@ -202,7 +193,7 @@ def _common_table(
         settings = {cell.setting for cell in paper}
         layout = LAYOUTS[name]
         header, rows, behind = wide(layout, [result for result in results if result.cell.setting in settings], {})
-        sections.append(markdown(layout.title, header, rows, behind, level=2))
+        sections.append(markdown(Table("table_common_rule", layout.title, header, rows, behind), level=2))
     every = reported_cells()
     return {
         "table_common_rule.md": "\n".join(sections),

@@ -37,6 +37,12 @@ class Table(NamedTuple):
     """Rows that start in italics belong to the row above."""
     notes: Sequence[Text]
 
+    @property
+    def heading(self) -> str:
+        """The title, after the number of the paper's table if it is one."""
+        number = re.fullmatch(r"table(\d)", self.name)
+        return f"Table {number[1]}: {self.title}" if number else self.title
+
 
 _MARKS = {"bold": "**", "italic": "*"}
 _COMMANDS = {"bold": "textbf", "italic": "textit"}
@@ -52,45 +58,41 @@ _ESCAPES = {
 }
 
 
-def markdown(
-    title: str, header: Sequence[str], rows: Sequence[Sequence[Text]], notes: Sequence[Text], level: int = 1
-) -> str:
-    """Write a table under its title, with notes below.
+def markdown(table: Table, level: int = 1) -> str:
+    """Write a table under its heading, with notes below.
 
-    :param level: of the title
+    :param level: of the heading
     """
-    table = [[_markdown_text(cell) for cell in row] for row in (header, ["---"] * len(header), *rows)]
-    lines = [f"{'#' * level} {title}", "", *(f"| {' | '.join(cells)} |" for cells in table)]
-    if notes:
-        lines += ["", *(f"- {_markdown_text(note)}" for note in notes)]
+    rows = table.header, ["---"] * len(table.header), *table.rows
+    lines = [f"{'#' * level} {table.heading}", ""]
+    lines += [f"| {' | '.join(map(_markdown_text, row))} |" for row in rows]
+    if table.notes:
+        lines += ["", *(f"- {_markdown_text(note)}" for note in table.notes)]
     return "\n".join(lines) + "\n"
 
 
-def latex(name: str, caption: str, header: Sequence[str], rows: Sequence[Sequence[Text]], notes: Sequence[Text]) -> str:
-    """Write a table to be put into a paper, with notes below; rows that start in italics belong to the row above.
-
-    :param name: of the label, ``tab:<name>``
-    """
+def latex(table: Table) -> str:
+    """Write a table to be put into a paper, with notes below; its label is ``tab:<name>``."""
     body: list[str] = []
-    grouped = any(is_italic(row[0]) for row in rows)
-    for row in rows:
+    grouped = any(is_italic(row[0]) for row in table.rows)
+    for row in table.rows:
         if grouped and body and not is_italic(row[0]):
             body.append(r"\addlinespace")
         body.append(_latex_row(row))
     tabular = [
-        rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}",
-        *_indented([r"\toprule", _latex_row(header), r"\midrule", *body, r"\bottomrule"]),
+        rf"\begin{{tabular}}{{@{{}}l{'c' * (len(table.header) - 1)}@{{}}}}",
+        *_indented([r"\toprule", _latex_row(table.header), r"\midrule", *body, r"\bottomrule"]),
         r"\end{tabular}",
     ]
-    small = [r"\begin{minipage}{\linewidth}", *_indented([rf"{_latex_text(note)}\par" for note in notes])]
+    small = [r"\begin{minipage}{\linewidth}", *_indented([rf"{_latex_text(note)}\par" for note in table.notes])]
     lines = [
         r"\centering",
-        rf"\caption{{{_latex_text(caption)}}}",
-        rf"\label{{tab:{name}}}",
+        rf"\caption{{{_latex_text(table.title)}}}",
+        rf"\label{{tab:{table.name}}}",
         r"\footnotesize",
         r"\setlength{\tabcolsep}{3pt}",
         *tabular,
-        *([r"\par\medskip", *small, r"\end{minipage}"] if notes else []),
+        *([r"\par\medskip", *small, r"\end{minipage}"] if table.notes else []),
     ]
     packages = "booktabs,amssymb" if any(r"\checkmark" in line for line in body) else "booktabs"
     return "\n".join([rf"% \usepackage{{{packages}}}", r"\begin{table}", *_indented(lines), r"\end{table}"]) + "\n"

@@ -7,6 +7,8 @@ import pytest
 from made_up import episode, finished, markdown_row, rounds
 
 from marl_encircle.experiments.records import Cell, Run, Setting
+from marl_encircle.study.cells import gather
+from marl_encircle.study.differences import difference_table
 from marl_encircle.study.tables import render_tables
 
 ONE = Setting(1.1, 3, 1)
@@ -45,6 +47,15 @@ def test_differences_are_given_under_the_own_and_the_common_rule() -> None:
         f"| Model A | 1.1 | 3 | 1 | all / pursuers | +100.00: {few} | no round both solve | +0.000: {few} | 1 |",
         f"| Model A | 1.1 | 3 | 1 | all / all | +0.00: {few} | +0.00: {few} |  | 1 |",
     ]
+
+
+def test_comparisons_that_nobody_ran_may_be_left_out_and_are_counted() -> None:
+    runs = gather([finished(method, ONE, 0, 90) for method in ("ours", "model_b")], {})
+    others = [Cell("model_b", ONE), Cell("model_a", ONE), Cell("ma2019", ONE)]
+    table = difference_table(others, runs, ["Note."])
+    assert [row[0] for row in table.rows] == ["Model B"]
+    assert table.notes[-2:] == ["Note.", "Rows left out in which one of the two is not run: 2."]
+    assert difference_table(others[:1], runs, ["Note."]).notes[-1] == "Note."
 
 
 def test_the_spread_of_the_contributing_angles_is_compared_under_the_own_rules() -> None:

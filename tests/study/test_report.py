@@ -34,7 +34,7 @@ from marl_encircle.study.report import replays
 from marl_encircle.study.report.charts import charts, ticks
 from marl_encircle.study.report.page import Page, html_table, render_page
 from marl_encircle.study.report.replays import ROUNDS, Played, ShownCell, pack, player_data, shown_cells
-from marl_encircle.study.report.write import report, without_missing, write_report
+from marl_encircle.study.report.write import report, write_report
 from marl_encircle.study.tables import main_tables
 from marl_encircle.study.typeset import Styled, Table
 
@@ -318,14 +318,6 @@ def test_every_number_of_the_tables_is_in_the_report() -> None:
                 text = part if isinstance(part, str) else part.text
                 assert all(number in page for number in re.findall(r"[-+]?\d+\.\d+", text))
     assert label("model_b") in page
-
-
-def test_differences_that_are_not_there_are_counted() -> None:
-    rows = [["Ma", "1.1", "not run"], ["Ma", "1.2", "+1.0"], ["Model A", "1.1", "not run"]]
-    table = without_missing(Table("table_differences", "Title", ["Method", "λ", "S"], rows, ["Note."]))
-    assert table.rows == [rows[1]]
-    assert table.notes == ["Note.", "Left out: 2 rows in which one of the two is not run."]
-    assert without_missing(table._replace(notes=[])).notes == []
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from made_up import finished
 
 from marl_encircle.experiments.records import Setting
 from marl_encircle.study.tables import MethodOptions, freeze_notes, render_table1, render_tables
-from marl_encircle.study.typeset import Styled, latex, markdown, to_csv
+from marl_encircle.study.typeset import Styled, Table, latex, markdown, to_csv
 
 HEADER = ["Method", "λ = 1.1", "n = 2"]
 
@@ -57,7 +57,8 @@ def test_every_latex_table_is_sound() -> None:
 
 
 def test_symbols_are_mathematics_and_signs_are_escaped() -> None:
-    text = latex("x", "At λ = 1.1, n = 3", HEADER, [["my_method", "95 % & {more}", "–"], ["#1", "~^", r"a\b $"]], [])  # noqa: RUF001
+    rows = [["my_method", "95 % & {more}", "–"], ["#1", "~^", r"a\b $"]]  # noqa: RUF001
+    text = latex(Table("x", "At λ = 1.1, n = 3", HEADER, rows, []))
     assert_sound(text)
     assert r"\caption{At $\lambda = 1.1$, $n = 3$}" in text
     assert latex_rows(text) == [
@@ -69,11 +70,11 @@ def test_symbols_are_mathematics_and_signs_are_escaped() -> None:
 
 def test_styles_are_marked_in_both_languages() -> None:
     rows = [["Ours", (Styled("99.3", "bold"), " / 16.5")], [Styled("paper", "italic"), "x"], ["Ma", "y"]]
-    assert markdown("T", ["a", "b"], rows, [("see ", Styled("paper", "italic"))]).splitlines() == [
+    assert markdown(Table("t", "T", ["a", "b"], rows, [("see ", Styled("paper", "italic"))])).splitlines() == [
         "# T", "", "| a | b |", "| --- | --- |", "| Ours | **99.3** / 16.5 |", "| *paper* | x |", "| Ma | y |", "",
         "- see *paper*",
     ]  # fmt: skip
-    lines = [line.strip() for line in latex("t", "T", ["a", "b"], rows, []).splitlines()]
+    lines = [line.strip() for line in latex(Table("t", "T", ["a", "b"], rows, [])).splitlines()]
     start = lines.index(r"\midrule")
     assert lines[start + 1 : start + 5] == [
         r"Ours & \textbf{99.3} / 16.5 \\", r"\textit{paper} & x \\", r"\addlinespace", r"Ma & y \\",
@@ -81,7 +82,7 @@ def test_styles_are_marked_in_both_languages() -> None:
 
 
 def test_rows_are_only_set_apart_where_some_belong_together() -> None:
-    assert "addlinespace" not in latex("t", "T", ["a", "b"], [["Ours", "x"], ["Ma", "y"]], [])
+    assert "addlinespace" not in latex(Table("t", "T", ["a", "b"], [["Ours", "x"], ["Ma", "y"]], []))
 
 
 def test_tables_of_unequal_records_are_refused() -> None:

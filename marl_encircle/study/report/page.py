@@ -87,14 +87,12 @@ def _lighter(colour: Colour) -> Colour:
 
 def html_table(table: Table) -> str:
     """Return a table in a section of its own, its notes folded away."""
-    number = re.fullmatch(r"table(\d)", table.name)
-    title = f"Table {number[1]}: {table.title}" if number else table.title
     paired = table.name in PAIRED
     rows = "".join(_row(row, paired, len(table.header)) for row in table.rows)
     notes = "".join(f"<li>{_inline(note)}</li>" for note in table.notes)
     folded = f"<details><summary>How to read it</summary><ul>{notes}</ul></details>" if notes else ""
     return (
-        f'<section class="table" aria-labelledby="{table.name}"><h3 id="{table.name}">{_escaped(title)}</h3>'
+        f'<section class="table" aria-labelledby="{table.name}"><h3 id="{table.name}">{_escaped(table.heading)}</h3>'
         f'<div class="scroll" tabindex="0" role="region" aria-labelledby="{table.name}">'
         f'<table class="{"paired" if paired else "plain"}"><thead>{_head(table.header, paired)}</thead>'
         f"<tbody>{rows}</tbody></table></div>{folded}</section>"

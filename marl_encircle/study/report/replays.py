@@ -27,7 +27,7 @@ from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import Cell, Run, Setting, run_path
 from marl_encircle.replays.replay import Replay, record_round
 from marl_encircle.study.cells import gather, result_of
-from marl_encircle.study.paper import label, rank
+from marl_encircle.study.paper import by_method, label
 
 ROUNDS = 6
 """Of each cell the first so many rounds of the evaluation, played by the policy of its first training seed."""
@@ -84,7 +84,7 @@ def shown_cells(
     by_cell = gather(runs, aliases)
     first = {run.cell: run for run in sorted(runs, key=lambda run: run.seed, reverse=True) if run.status == "finished"}
     shown = []
-    for cell in sorted({*asked, *by_cell}, key=lambda cell: (rank(cell.method), cell)):
+    for cell in by_method({*asked, *by_cell}):
         result = result_of(cell, by_cell.get(cell))
         owner = result.runs.runs_of if result.runs else None
         if result.summary is None:

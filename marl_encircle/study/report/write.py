@@ -17,7 +17,6 @@ from marl_encircle.study.report.page import Page, render_page
 from marl_encircle.study.report.replays import player_data, shown_cells
 from marl_encircle.study.reproduce import TABLE1_METHODS, options_of
 from marl_encircle.study.tables import freeze_notes, main_tables, table1
-from marl_encircle.study.typeset import Table
 
 
 def write_report(grid: Grid | None, results: str | Path) -> Path:
@@ -42,10 +41,9 @@ def report(grid: Grid | None, folder: Path) -> str:
     shown = _of_grid(grid, folder) if grid is not None else _of_all(folder)
     runs, cells, aliases, notes = shown.runs, shown.cells, shown.aliases, shown.notes
     options = {method: options_of(method) for method in TABLE1_METHODS}
-    *tables, differences = main_tables(runs, aliases, cells, notes)
     page = Page(
         facts=shown.facts,
-        tables=[table1(options, notes), *tables, without_missing(differences)],
+        tables=[table1(options, notes), *main_tables(runs, aliases, cells, notes)],
         charts=charts(read_bands(runs, folder), sorted(cells), aliases),
         player=player_data(shown_cells(runs, folder, aliases, cells)),
     )
@@ -92,17 +90,6 @@ def _check_alike(path: Path, first: Path) -> None:
             f"{path} and {first} are of one cell and were not trained alike ({lines[0]}): write a grid of those that "
             "are meant and give it by --grid"
         )
-
-
-def without_missing(differences: Table) -> Table:
-    """Return the differences without the rows that have nothing to compare, which are counted in a note."""
-    rows = [row for row in differences.rows if _NOT_RUN not in row]
-    missing = len(differences.rows) - len(rows)
-    notes = [*differences.notes, f"Left out: {missing} rows in which one of the two is not run."]
-    return differences._replace(rows=rows, notes=notes) if missing else differences
-
-
-_NOT_RUN = "not run"
 
 
 def _facts(runs: Sequence[Run], asked: int, seeds: Iterable[int]) -> list[tuple[str, str]]:
