@@ -8,6 +8,10 @@ from marl_encircle.core.scenario import Scenario
 from marl_encircle.experiments import metrics
 from marl_encircle.experiments.episodes import Episode
 from marl_encircle.experiments.records import Cell, Run, Setting, Status
+from marl_encircle.study.paper import label
+
+NOT_RUN = "not run"
+"""What is said of a cell without any run."""
 
 OTHER_STATUSES: tuple[Status, ...] = ("diverged", "unfinished", "not evaluated")
 
@@ -44,7 +48,7 @@ class Result(NamedTuple):
     def status(self) -> str:
         """``run`` where there are numbers, else what is there instead."""
         if self.runs is None:
-            return "not run"
+            return NOT_RUN
         return "run" if self.summary else ", ".join(status for status in OTHER_STATUSES if self.runs.others[status])
 
     @property
@@ -102,6 +106,21 @@ def result_of(cell: Cell, runs: CellRuns | None, closure: Closure | None = None)
     closure = closure or (runs.closure if runs else None)
     summary = metrics.summarise_cell(runs.finished, closure) if runs and runs.finished and closure else None
     return Result(cell, runs, closure, summary)
+
+
+def absences(cells: Mapping[Cell, CellRuns]) -> dict[Cell, str]:
+    """Say why there are no numbers of a cell's own to draw, of the cells of which that is so.
+
+    :param cells: all that have or share runs; any other is not run
+    """
+    absent = {}
+    for cell, runs in cells.items():
+        result = result_of(cell, runs)
+        if result.summary is None:
+            absent[cell] = result.status
+        elif runs.runs_of is not None:
+            absent[cell] = f"runs of {label(runs.runs_of)}"
+    return absent
 
 
 def pursuers_suffice(setting: Setting) -> bool:

@@ -7,7 +7,7 @@ from marl_encircle.core.geometry import Closure
 from marl_encircle.experiments import metrics
 from marl_encircle.experiments.metrics import Difference
 from marl_encircle.experiments.records import Cell
-from marl_encircle.study.cells import CellRuns, Result
+from marl_encircle.study.cells import NOT_RUN, CellRuns, Result
 from marl_encircle.study.paper import PAPER_METHODS, label
 from marl_encircle.study.typeset import Table, estimate_columns, markdown, setting_columns, to_csv, with_interval
 
@@ -20,9 +20,6 @@ _NOTES = [
     "In brackets: 95 % interval of the mean over the common training seeds; one seed has none.",
     "No difference shown: the interval covers zero. The intervals are each for itself.",
 ]
-
-
-_NOT_RUN = "not run"
 
 
 class _Row(NamedTuple):
@@ -59,7 +56,7 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
 def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
     """Return as a table the rows of :func:`render_differences` in which both methods have runs; others are counted."""
     rows = _all_rows(cells, runs)
-    there = [row for row in rows if row.nothing != _NOT_RUN]
+    there = [row for row in rows if row.nothing != NOT_RUN]
     missing = len(rows) - len(there)
     left_out = [f"Rows left out in which one of the two is not run: {missing}."] if missing else []
     return _table(there, [*notes, *left_out])
@@ -126,7 +123,7 @@ def paired_success(first: Result, second: Result) -> Difference | None:
 def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:
     """Why two cells cannot be compared; None if they can."""
     if first is None or second is None:
-        return _NOT_RUN
+        return NOT_RUN
     if not first.finished or not second.finished:
         return "no finished run"
     if first.finished is second.finished:

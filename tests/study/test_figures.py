@@ -31,9 +31,10 @@ from marl_encircle.experiments.grid import load_grid
 from marl_encircle.experiments.learning_curve import curve_from_csv
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import share_interval, summarise_cell
-from marl_encircle.experiments.records import Cell, Setting, read_runs
+from marl_encircle.experiments.records import Cell, Run, Setting, read_runs
 from marl_encircle.experiments.train import OtherRunError, run_folder, train, write_episodes
 from marl_encircle.replays.replay import Replay, record_round
+from marl_encircle.study.cells import absences, gather
 from marl_encircle.study.figures import canvas, curves, situations, write
 from marl_encircle.study.figures.canvas import encode, rgb
 from marl_encircle.study.figures.contributions import draw_figure5
@@ -57,7 +58,7 @@ def figure4() -> Figure:
         Cell("model_b", OPEN): band([0.0, 0.3, 0.4], [0.1, 0.2, 0.3]),
         Cell("ma2019", OBSTACLE): band([0.2, 0.3, 0.7]),
     }
-    return draw_figure4(bands, aliases={Cell("model_b", OBSTACLE): Cell("ma2019", OBSTACLE)})
+    return draw_figure4(bands, absent={Cell("model_b", OBSTACLE): "runs of Ma"})
 
 
 def figure5() -> Figure:
@@ -221,6 +222,19 @@ def test_figure_4_says_what_is_not_there() -> None:
     assert words(draw_figure4({})).count("not run") == 2
 
 
+def test_figures_tell_what_diverged_from_what_is_not_run() -> None:
+    diverged = Run(Cell("ours", OBSTACLE), 0, "diverged", "all")
+    absent = absences(gather([diverged], {Cell("model_b", OBSTACLE): Cell("ours", OBSTACLE)}))
+    assert absent == {Cell(method, OBSTACLE): "diverged" for method in ("ours", "model_b")}
+    written = words(draw_figure4({}, absent=absent))
+    assert {"Ours: diverged", "Model B: diverged", "Ma: not run"} <= set(written)
+    assert written.count("not run") == 1, "without an obstacle"
+    written = words(draw_figure5({}, absent))
+    assert {"Ours, n = 3: diverged", "Ours, n = 2, 4, 5: not run"} <= set(written)
+    column = write._column(PLACES[1], [diverged], absent, Path())
+    assert column == Column("one obstacle", None, note="diverged")
+
+
 def test_points_that_a_seed_lacks_are_left_out() -> None:
     texts = ("world_steps,success\n100,0.5\n200,0.6\n300,0.7\n", "world_steps,success\n200,0.8\n300,0.9\n400,1.0\n")
     joint = band_of([curve_from_csv(text) for text in texts], 200)
@@ -315,7 +329,8 @@ def test_a_policy_of_one_obstacle_is_not_shown_in_a_scene_of_several(tmp_path: P
     config = load_config(profile="smoke", overrides=[*TINY, "scenario.composite_unit=false"])
     train(config, 0, "native", tmp_path)
     concave = next(place for place in PLACES if place.setting.scene == "concave")
-    assert write._column(concave, read_runs(tmp_path), tmp_path) == Column("concave", None, note="several obstacles")
+    column = write._column(concave, read_runs(tmp_path), {}, tmp_path)
+    assert column == Column("concave", None, note="several obstacles")
 
 
 def test_all_figures_are_written_and_the_same_runs_give_the_same_bytes(

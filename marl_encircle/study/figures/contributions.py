@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from marl_encircle.experiments.metrics import CellSummary, Estimate
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.study.cells import NOT_RUN
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.study.figures.curves import series_of
 from marl_encircle.study.paper import label
@@ -18,16 +19,17 @@ SETTINGS = tuple(Setting(1.1, pursuers, 1) for pursuers in (2, 3, 4, 5))
 
 
 @style()
-def draw_figure5(summaries: Mapping[Cell, CellSummary]) -> Figure:
+def draw_figure5(summaries: Mapping[Cell, CellSummary], absent: Mapping[Cell, str] | None = None) -> Figure:
     """Draw sigma_c and success over the number of pursuers, with intervals over the training seeds.
 
     :param summaries: of the cells that have finished runs, under each method's own rule
+    :param absent: cell -> why it has none, unless it is not run
     """
     figure = Figure((WIDTH, 2.6))
     spread, success = figure.subplots(1, 2)
     figure.subplots_adjust(left=0.07, right=0.985, top=0.9, bottom=0.295, wspace=0.2)
-    handles = _draw_panel(spread, summaries, lambda summary: summary.sigma_c, 1.0)
-    _draw_panel(success, summaries, lambda summary: summary.success, 100.0)
+    handles = _draw_panel(spread, summaries, lambda summary: summary.sigma_c, 1.0, absent or {})
+    _draw_panel(success, summaries, lambda summary: summary.success, 100.0, absent or {})
     write_letter(spread, "a", "spread of the contributing angles, all rounds")
     write_letter(success, "b", "success")
     spread.set_ylabel(r"$\sigma_c$ [rad]")
@@ -41,7 +43,11 @@ def draw_figure5(summaries: Mapping[Cell, CellSummary]) -> Figure:
 
 
 def _draw_panel(
-    axes: Axes, summaries: Mapping[Cell, CellSummary], value: Callable[[CellSummary], Estimate], scale: float
+    axes: Axes,
+    summaries: Mapping[Cell, CellSummary],
+    value: Callable[[CellSummary], Estimate],
+    scale: float,
+    absent: Mapping[Cell, str],
 ) -> list[Artist]:
     """Draw one figure of merit of all methods; return what is to be in the legend."""
     handles: list[Artist] = []
@@ -54,13 +60,15 @@ def _draw_panel(
             places = [setting.pursuers + shift for setting in settings]
             won = [summary.success.mean >= 0.5 for summary in found]
             handles.append(_draw_method(axes, method, places, [value(summary) for summary in found], scale, won))
-        if len(settings) < len(SETTINGS):
-            absent = ", ".join(str(setting.pursuers) for setting in SETTINGS if setting not in settings)
-            missing.append(f"{label(method)}, n = {absent}: not run")
+        reasons: dict[str, list[str]] = {}
+        for setting in SETTINGS:
+            if setting not in settings:
+                reasons.setdefault(absent.get(Cell(method, setting), NOT_RUN), []).append(str(setting.pursuers))
+        missing += [f"{label(method)}, n = {', '.join(numbers)}: {reason}" for reason, numbers in reasons.items()]
     axes.set(xlim=(1.6, 5.4), xticks=[setting.pursuers for setting in SETTINGS], xlabel="number of pursuers n")
     axes.grid(axis="y")
-    if not handles:
-        say(axes, "not run")
+    if not handles and not absent:
+        say(axes, NOT_RUN)
     elif missing:
         note(axes, "\n".join(missing))
     return handles

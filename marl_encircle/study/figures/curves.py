@@ -13,6 +13,7 @@ from marl_encircle.drawing.palette import SERIES, Series
 from marl_encircle.experiments.learning_curve import Curve
 from marl_encircle.experiments.metrics import share_interval
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.study.cells import NOT_RUN
 from marl_encircle.study.figures.canvas import WIDTH, note, put_below, rgb, say, style, write_letter
 from marl_encircle.study.paper import label, rank
 
@@ -85,13 +86,13 @@ def in_order(methods: Iterable[str]) -> list[str]:
 
 @style()
 def draw_figure4(
-    bands: Mapping[Cell, Band], methods: Sequence[str] = FIGURE4_METHODS, aliases: Mapping[Cell, Cell] | None = None
+    bands: Mapping[Cell, Band], methods: Sequence[str] = FIGURE4_METHODS, absent: Mapping[Cell, str] | None = None
 ) -> Figure:
     """Draw success over world steps: mean, interval and every seed, one panel without and one with an obstacle.
 
     :param bands: of the cells that have runs
     :param methods: to show, the most important one first
-    :param aliases: cell -> the cell whose runs it shares; it is named, not drawn again
+    :param absent: cell -> why it has no curve, unless it is not run
     """
     figure = Figure((WIDTH, 2.7))
     all_axes = figure.subplots(1, len(SETTINGS), sharey=True)
@@ -101,7 +102,8 @@ def draw_figure4(
         present = [method for method in methods if Cell(method, setting) in bands]
         for method in reversed(present):
             shown[method] = _draw_band(axes, bands[Cell(method, setting)], method, methods)
-        _write_missing(axes, setting, [method for method in methods if method not in present], aliases or {}, present)
+        cells = [Cell(method, setting) for method in methods if method not in present]
+        _write_missing(axes, {cell: (absent or {}).get(cell, NOT_RUN) for cell in cells}, bool(present))
         _arrange(axes)
         title = "no obstacle" if setting.obstacles == 0 else "one obstacle"
         write_letter(axes, letter, f"{title}, n = {setting.pursuers}, λ = {setting.speed_ratio:g}")
@@ -126,19 +128,12 @@ def _draw_band(axes: Axes, band: Band, method: str, methods: Sequence[str]) -> A
     return line
 
 
-def _write_missing(
-    axes: Axes, setting: Setting, missing: Sequence[str], aliases: Mapping[Cell, Cell], present: Sequence[str]
-) -> None:
+def _write_missing(axes: Axes, missing: Mapping[Cell, str], are_others_drawn: bool) -> None:
     """Say what is not drawn and why."""
-    lines = []
-    for method in missing:
-        owner = aliases.get(Cell(method, setting))
-        shares = owner is not None and owner.method in present
-        lines.append(f"{label(method)}: {f'runs of {label(owner.method)}' if owner and shares else 'not run'}")
-    if not present:
-        say(axes, "not run")
-    elif lines:
-        note(axes, "\n".join(lines))
+    if not are_others_drawn and set(missing.values()) == {NOT_RUN}:
+        say(axes, NOT_RUN)
+    elif missing:
+        note(axes, "\n".join(f"{label(cell.method)}: {reason}" for cell, reason in missing.items()))
 
 
 def _arrange(axes: Axes) -> None:

@@ -15,6 +15,7 @@ from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
 from marl_encircle.experiments.records import CURVE, Cell, Run, read_record, run_path
 from marl_encircle.replays.replay import record_round
+from marl_encircle.study.cells import NOT_RUN, absences, gather
 from marl_encircle.study.figures import contributions, curves
 from marl_encircle.study.figures.canvas import encode
 from marl_encircle.study.figures.contributions import draw_figure5
@@ -53,14 +54,16 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
     """
     runs = runs_of(grid, folder)
     bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
+    by_cell = gather(runs, grid.aliases)
+    absent = absences(by_cell)
     methods = {cell.method for cell in grid.cells if cell.setting in curves.SETTINGS}
     return {
         "figure1": draw_figure1(),
         "figure3": draw_figure3(),
-        "figure4": draw_figure4(bands, aliases=grid.aliases),
-        "figure4_all": draw_figure4(bands, in_order(methods), grid.aliases),
-        "figure5": draw_figure5(_summaries(runs)),
-        "figure6": draw_figure6([_column(place, runs, folder) for place in PLACES]),
+        "figure4": draw_figure4(bands, absent=absent),
+        "figure4_all": draw_figure4(bands, in_order(methods), absent),
+        "figure5": draw_figure5(_summaries(runs), absent),
+        "figure6": draw_figure6([_column(place, runs, absent, folder) for place in PLACES]),
     }
 
 
@@ -101,7 +104,7 @@ def _summaries(runs: Sequence[Run]) -> Mapping[Cell, CellSummary]:
     return summaries
 
 
-def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
+def _column(place: Place, runs: Sequence[Run], absent: Mapping[Cell, str], folder: Path) -> Column:
     """Replay the round of a place: of the first finished training seed, chosen by rule.
 
     Where no policy was trained in a scene, that of single discs is put there as it is.
@@ -109,7 +112,8 @@ def _column(place: Place, runs: Sequence[Run], folder: Path) -> Column:
     cells = [Cell(METHOD, place.setting), Cell(METHOD, place.setting._replace(scene="random"))]
     found = [run for cell in cells for run in runs if run.cell == cell and run.status == "finished"]
     if not found:
-        return Column(place.title, None, note="not run")
+        reasons = [absent[cell] for cell in cells if cell in absent]
+        return Column(place.title, None, note=reasons[0] if reasons else NOT_RUN)
     run = found[0]
     policy, config, _ = load_run(folder / run_path(run.cell, run.seed))
     rounds, evaluation, scene, notes = run.episodes, config.evaluation, place.setting.scene, []

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from marl_encircle.drawing.palette import SERIES
 from marl_encircle.experiments.records import Cell, Setting
+from marl_encircle.study.cells import NOT_RUN
 from marl_encircle.study.figures.curves import Band, series_of
 from marl_encircle.study.paper import label, rank
 from marl_encircle.study.report.replays import in_words
@@ -19,24 +20,29 @@ LEFT, RIGHT, TOP, BOTTOM = 36, 352, 10, 186
 _MILLION = 1e6
 
 
-def charts(bands: Mapping[Cell, Band], asked: Sequence[Cell], aliases: Mapping[Cell, Cell]) -> str:
+def charts(bands: Mapping[Cell, Band], asked: Sequence[Cell], absent: Mapping[Cell, str]) -> str:
     """Return a legend and a panel for each setting: mean, interval and every seed of each method.
 
     :param bands: of the cells that have finished runs
     :param asked: all cells; those without curves are named
-    :param aliases: cell -> the cell whose runs it shares
+    :param absent: cell -> why it has no curve, unless it is not run
     """
     methods = sorted({cell.method for cell in asked}, key=rank)
     settings = sorted({cell.setting for cell in asked})
     drawn = [setting for setting in settings if any(Cell(method, setting) in bands for method in methods)]
     parts = []
     if drawn:
-        panels = (_panel(setting, bands, asked, aliases, methods) for setting in drawn)
+        panels = (_panel(setting, bands, asked, absent, methods) for setting in drawn)
         legend = _legend([method for method in methods if any(cell.method == method for cell in bands)], methods)
         parts += [legend, '<div class="charts">', *panels, "</div>"]
-    without = [in_words(setting) for setting in settings if setting not in drawn]
-    if without:
-        parts.append(f'<p class="quiet">Not run: {escape("; ".join(without))}.</p>')
+    without: dict[str, list[str]] = {}
+    for setting in settings:
+        if setting not in drawn:
+            reasons = (absent.get(cell, NOT_RUN) for cell in asked if cell.setting == setting)
+            without.setdefault(", ".join(dict.fromkeys(reasons)), []).append(in_words(setting))
+    for reason, names in without.items():
+        text = f"{reason[0].upper()}{reason[1:]}: {'; '.join(names)}."
+        parts.append(f'<p class="quiet">{escape(text)}</p>')
     return "\n".join(parts)
 
 
@@ -53,7 +59,7 @@ def _panel(
     setting: Setting,
     bands: Mapping[Cell, Band],
     asked: Sequence[Cell],
-    aliases: Mapping[Cell, Cell],
+    absent: Mapping[Cell, str],
     methods: Sequence[str],
 ) -> str:
     cells = {method: Cell(method, setting) for method in methods}
@@ -61,13 +67,12 @@ def _panel(
     last = max(float(band.world_steps[-1]) for band in present.values()) or 1.0
     ends = ", ".join(f"{label(method)} {100 * band.mean[-1]:.0f} %" for method, band in present.items())
     curves = "".join(_band(band, method, methods, last) for method, band in reversed(present.items()))
-    absent = []
-    for method, cell in cells.items():
-        owner = aliases.get(cell)
-        if method not in present and cell in asked:
-            shares = owner is not None and owner in bands
-            absent.append(f"{label(method)}: {f'runs of {label(owner.method)}' if owner and shares else 'not run'}")
-    note = f'<span class="quiet">{escape("; ".join(absent))}</span>' if absent else ""
+    missing = [
+        f"{label(method)}: {absent.get(cell, NOT_RUN)}"
+        for method, cell in cells.items()
+        if method not in present and cell in asked
+    ]
+    note = f'<span class="quiet">{escape("; ".join(missing))}</span>' if missing else ""
     return (
         f'<figure class="chart"><figcaption>{escape(in_words(setting))}{note}</figcaption>'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img"'

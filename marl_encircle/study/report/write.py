@@ -11,6 +11,7 @@ from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.loading import config_of
 from marl_encircle.experiments.records import Cell, Run, read_record, read_runs, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
+from marl_encircle.study.cells import absences, gather
 from marl_encircle.study.figures.write import read_bands
 from marl_encircle.study.report.charts import charts
 from marl_encircle.study.report.page import Page, render_page
@@ -44,7 +45,7 @@ def report(grid: Grid | None, folder: Path) -> str:
     page = Page(
         facts=shown.facts,
         tables=[table1(options, notes), *main_tables(runs, aliases, cells, notes)],
-        charts=charts(read_bands(runs, folder), sorted(cells), aliases),
+        charts=charts(read_bands(runs, folder), sorted(cells), absences(gather(runs, aliases))),
         player=player_data(shown_cells(runs, folder, aliases, cells)),
     )
     return render_page(page)
