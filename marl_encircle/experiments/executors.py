@@ -64,8 +64,8 @@ class LocalExecutor:
 
 def _start(job: Job, out: str | Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "marl_encircle", "train", *arguments(job), "--out", str(out), "--quiet"]
-    # A group of its own: Ctrl-C reaches the sweep alone, which then stops its workers in order.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    # A session of its own: Ctrl-C reaches the sweep alone, which then stops its workers in order.
     return subprocess.Popen(
         command, env=environment, stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_die_with_parent
     )

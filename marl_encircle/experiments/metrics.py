@@ -44,7 +44,7 @@ class RoundKey(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """Two-sided 95 % interval."""
+    """Two-sided interval, of 95 % unless another is asked for."""
 
     low: float
     high: float

@@ -113,6 +113,7 @@ def sweep(
         anything is written; other executors' machines are not known
     :raises FolderLockedError: if another sweep works in ``out``
     :raises OtherRunError: if a finished run there has another configuration
+    :raises DamagedFileError: if a record there is not what a run writes
     :raises Stopped: after SIGINT or SIGTERM, when all workers have written their checkpoints
     """
     executor = executor or LocalExecutor()

@@ -88,7 +88,7 @@ def _lighter(colour: Colour) -> Colour:
 def html_table(table: Table) -> str:
     """Return a table in a section of its own, its notes folded away."""
     paired = table.name in PAIRED
-    rows = "".join(_row(row, paired, len(table.header)) for row in table.rows)
+    rows = "".join(_row(row, paired) for row in table.rows)
     notes = "".join(f"<li>{_inline(note)}</li>" for note in table.notes)
     folded = f"<details><summary>How to read it</summary><ul>{notes}</ul></details>" if notes else ""
     return (
@@ -109,9 +109,8 @@ def _head(header: Sequence[str], paired: bool) -> str:
     return f'<tr><th scope="col" rowspan="2">{escape(first)}</th>{settings}</tr><tr>{halves}</tr>'
 
 
-def _row(row: Sequence[Text], paired: bool, width: int) -> str:
+def _row(row: Sequence[Text], paired: bool) -> str:
     first, *cells = row
-    cells = [*cells, *[""] * (width - 1 - len(cells))]
     body = "".join(map(_pair if paired else _cell, cells))
     kind = ' class="paper"' if is_italic(first) else ""
     return f'<tr{kind}><th scope="row">{_plain(first)}</th>{body}</tr>'
