@@ -59,7 +59,7 @@ def test_policy_and_chance_play_the_same_rounds_which_nobody_trained_on(monkeypa
 
 
 def test_the_return_is_the_mean_of_the_agents() -> None:
-    returns = module.play_rounds("imitation", imitation.Imitation, lambda seen: seen + np.float32([[0.1], [0.3]]), 3)
+    returns = module.play_returns("imitation", imitation.Imitation, lambda seen: seen + np.float32([[0.1], [0.3]]), 3)
     np.testing.assert_allclose(returns, -5 * 0.2, atol=1e-5)
 
 
@@ -67,7 +67,7 @@ def test_rounds_that_no_longer_end_together_or_at_all_are_refused(monkeypatch: p
     monkeypatch.setattr(module, "MAX_ROUND", 50)
     for unfit, reason in (("staggered", "only left went on; all agents must end together"), ("endless", "not ended")):
         with pytest.raises(ConfigError, match=f"^imitation: .*{reason}"):
-            module.play_rounds("imitation", lambda unfit=unfit: imitation.Imitation(unfit=unfit), lambda seen: seen, 1)
+            module.play_returns("imitation", lambda unfit=unfit: imitation.Imitation(unfit=unfit), lambda seen: seen, 1)
     with pytest.raises(ConfigError, match=r"^imitation: world 0: .* ended, .* did not"):
         play_with("imitation", lambda: imitation.Imitation(unfit="staggered"), world_steps=200)
 

@@ -27,9 +27,6 @@ from marl_encircle.study.figures.canvas import SMALL, rgb
 
 Array = NDArray[np.float64]
 
-_BODY = 10.5
-"""Diameter of a pursuer where bodies are not to scale [points]."""
-
 
 def show_square(axes: Axes, centre: Array, half_width: float) -> None:
     """Show a square of the scene, as wide as high, without ticks."""
@@ -111,15 +108,16 @@ def draw_gaps(axes: Axes, moment: Snapshot, length: float) -> None:
         axes.annotate("", tip, tail, arrowprops=arrow, zorder=6)
 
 
-def draw_bodies(axes: Axes, moment: Snapshot, labels: Sequence[str]) -> None:
+def draw_bodies(axes: Axes, moment: Snapshot, labels: Sequence[str], size: float = 10.5) -> None:
     """Draw pursuers with their numbers, and the target, in sizes of letters, not to scale.
 
     :param labels: of the pursuers
+    :param size: diameter of a pursuer [points]
     """
     for i, ((x, y), label) in enumerate(zip(moment.pursuers, labels, strict=True)):
         colour = pursuer_colour(i)
         axes.plot(
-            x, y, "o", color=rgb(colour), markersize=_BODY, markeredgecolor=rgb(INK), markeredgewidth=0.6, zorder=7
+            x, y, "o", color=rgb(colour), markersize=size, markeredgecolor=rgb(INK), markeredgewidth=0.6, zorder=7
         )
         axes.annotate(
             label,
@@ -130,7 +128,7 @@ def draw_bodies(axes: Axes, moment: Snapshot, labels: Sequence[str]) -> None:
             va="center_baseline",
             zorder=8,
         )
-    draw_target(axes, moment.target, 0.72 * _BODY)
+    draw_target(axes, moment.target, 0.72 * size)
 
 
 def draw_target(axes: Axes, place: Array, size: float) -> None:
