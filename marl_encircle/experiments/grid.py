@@ -1,6 +1,6 @@
 """A grid file -> the runs it asks for: methods x settings x seeds."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
@@ -273,7 +273,7 @@ def _in_words(setting: Setting) -> str:
     return f"{setting.symbols}, {setting.scene}"
 
 
-def _check_shared(shared: Iterable[Shared], aliases: Iterable[Cell], trained: Iterable[Cell]) -> None:
+def _check_shared(shared: Sequence[Shared], aliases: Iterable[Cell], trained: Iterable[Cell]) -> None:
     """Refuse an entry that means no cell of the grid."""
     aliases = list(aliases)
     methods = {cell.method for cell in (*aliases, *trained)}
@@ -282,6 +282,8 @@ def _check_shared(shared: Iterable[Shared], aliases: Iterable[Cell], trained: It
             raise ConfigError(f"shared.{i}.method: {entry.method!r:.80} is not here{nearest(entry.method, methods)}")
         if not any((cell.method, cell.setting.obstacles) == (entry.method, entry.obstacles) for cell in aliases):
             raise ConfigError(f"shared.{i}.obstacles: no setting of {entry.method} has {entry.obstacles}")
+        if any((other.method, other.obstacles) == (entry.method, entry.obstacles) for other in shared[:i]):
+            raise ConfigError(f"shared.{i}: {entry.method} is there for obstacles {entry.obstacles} already")
 
 
 def _runs_of(cell: Cell, shared: Iterable[Shared]) -> str | None:

@@ -219,12 +219,13 @@ def _other_table(results: Sequence[Result], more: Sequence[str]) -> Table:
 
 def _own_rule_note(results: Sequence[Result]) -> str:
     """Say what S is, and whose rule is which."""
-    methods = {
-        rule: list(dict.fromkeys(label(result.cell.method) for result in results if result.closure == closure))
-        for closure, rule in _RULES.items()
-    }
-    whose = "; ".join(f"{rule}: {' and '.join(names)}" for rule, names in methods.items() if names)
-    rules = f" ({whose})" if whose else ""
+    own = [result for result in results if _owner(result) is None]
+    parts = []
+    for closure, rule in _RULES.items():
+        names = list(dict.fromkeys(label(result.cell.method) for result in own if result.closure == closure))
+        if names:
+            parts.append(f"{rule}: {' and '.join([', '.join(names[:-1]), names[-1]] if names[1:] else names)}")
+    rules = f" ({'; '.join(parts)})" if parts else ""
     return f"S: share of the evaluation rounds that end enclosed, in %, each method under its own closure rule{rules}."
 
 

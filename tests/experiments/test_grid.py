@@ -322,6 +322,14 @@ def test_a_bad_grid_is_refused_by_key_and_reason(tmp_path: Path, old: str, new: 
     assert reason in str(caught.value)
 
 
+def test_runs_are_shared_once(tmp_path: Path) -> None:
+    entry = "{method: model_b, runs_of: ours, obstacles: 1}"
+    text = GRID.format(method="model_b").replace("shared: []", f"shared: [{entry}]")
+    assert grid_of(tmp_path, text).aliases == {Cell("model_b", ONE): OURS}
+    with pytest.raises(ConfigError, match=r"grid\.yaml: shared\.1: model_b is there for obstacles 1 already"):
+        grid_of(tmp_path, text.replace(entry, f"{entry}, {entry}"))
+
+
 def test_a_seed_of_the_evaluation_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"grid\.yaml: seed must differ from evaluation\.seed: .*; got 4000"):
         grid_of(tmp_path, GRID.format(method="ours").replace("[2, 3, 2]", "[2, 4000]"))

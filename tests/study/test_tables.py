@@ -258,6 +258,7 @@ def test_an_alias_shows_whose_runs_it_has_and_own_runs_come_first() -> None:
     assert our_row(text, "Model A") == our_row(text, "Ours") == ["96.0 [83.3, 100.0] / 20.0", *["not run"] * 3]
     assert behind(text) == "2 seeds (0 1) of 100 rounds."
     assert "- The runs of Ours are shown for Model A at m = 0 too.\n" in text
+    assert "under its own closure rule (pursuers and obstacles: Ours)." in text
     assert csv_row(rendered["table4.csv"], method="model_a", obstacles="0")["runs_of"] == "ours"
     assert markdown_row(rendered["table_differences.md"], "Model A", "1.1", "3", "0")[1] == "the same runs"
     own = tables.render_tables([*runs, finished("model_a", OPEN, 0, 50, closure="pursuers")], aliases)

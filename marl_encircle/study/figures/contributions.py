@@ -67,7 +67,7 @@ def _draw_panel(
         missing += [f"{label(method)}, n = {', '.join(numbers)}: {reason}" for reason, numbers in reasons.items()]
     axes.set(xlim=(1.6, 5.4), xticks=[setting.pursuers for setting in SETTINGS], xlabel="number of pursuers n")
     axes.grid(axis="y")
-    if not handles and not absent:
+    if not handles and not any(Cell(method, setting) in absent for method in METHODS for setting in SETTINGS):
         say(axes, NOT_RUN)
     elif missing:
         note(axes, "\n".join(missing))

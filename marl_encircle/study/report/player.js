@@ -58,7 +58,10 @@ function startPlayer(data) {
     fill(parts.round, rounds, parts.round.value);
     const others = entries
       .filter((entry) => entry.value !== number(parts.method))
-      .map((entry) => ({ ...entry, disabled: roundsOf(cellAt(entry.value, setting)).length <= number(parts.round) }));
+      .map((entry) => {
+        const lacks = !entry.disabled && roundsOf(cellAt(entry.value, setting)).length <= number(parts.round);
+        return lacks ? { ...entry, text: `${entry.text} (without this round)`, disabled: true } : entry;
+      });
     fill(parts.other, [{ value: -1, text: "nobody" }, ...others], parts.other.value || -1);
   }
 
