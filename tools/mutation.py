@@ -49,6 +49,7 @@ TESTS = {
     "maddpg/matd3.py": ("maddpg/test_maddpg.py",),
     "maddpg/models.py": ("maddpg/test_networks.py", "maddpg/test_gradients.py", "maddpg/test_maddpg.py"),
     "maddpg/policies.py": ("maddpg/test_networks.py", "maddpg/test_maddpg.py"),
+    "maddpg/rollouts.py": ("maddpg/test_maddpg.py",),
     "maddpg/saving.py": ("maddpg/test_saving.py", "maddpg/test_maddpg.py"),
     "experiments/config.py": ("experiments/test_config.py", "experiments/test_features.py"),
     "experiments/faults.py": ("experiments/test_faults.py", "experiments/test_config.py"),
