@@ -38,6 +38,12 @@ Array = NDArray[np.float64]
 SPEED_RATIO = 1.3
 DIRECTIONS = 720
 
+_MISSED: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": rgb(INK), "markeredgewidth": 0.8}
+_OCCUPIED = PURSUERS[5]
+"""The paper's occupied angle is orange, its contributing angle blue."""
+_BEARINGS, _DISTANCES = (8.0, 82.0, 180.0, 278.0), (1.0, 0.7, 0.95, 1.05)
+"""The pursuers of Figure 3 as seen from the target: degrees and distances."""
+
 
 class Situation(NamedTuple):
     """A panel of Figure 1."""
@@ -126,9 +132,6 @@ def _draw_situation(axes: Axes, situation: Situation) -> None:
     write_shares(axes, moment, n + (len(moment.discs) if situation.closure == "all" else 0))
 
 
-_MISSED: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": rgb(INK), "markeredgewidth": 0.8}
-
-
 def _legend() -> list[Artist]:
     dot: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     return [
@@ -152,9 +155,6 @@ def draw_figure3() -> Figure:
     _draw_circle(axes, moment)
     draw_bodies(axes, moment, ["1", "2", "3", "4"])
     return figure
-
-
-_BEARINGS, _DISTANCES = (8.0, 82.0, 180.0, 278.0), (1.0, 0.7, 0.95, 1.05)
 
 
 def _draw_circle(axes: Axes, moment: Snapshot) -> None:
@@ -187,7 +187,3 @@ def _draw_circle(axes: Axes, moment: Snapshot) -> None:
     axes.annotate(r"$R_m$", (-0.3, -0.24), **note)
     axes.annotate("$T$", (-0.17, 0.12), **note)
     axes.annotate("$o_1$", polar(centre, ahead + 1.0, np.array([radius + 0.18]))[0], color=colour, **note)
-
-
-_OCCUPIED = PURSUERS[5]
-"""The paper's occupied angle is orange, its contributing angle blue."""
