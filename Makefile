@@ -110,7 +110,7 @@ train: $(READY)  ## one training run: REWARD SPEED_RATIO PURSUERS OBSTACLES SCEN
 	$(TRAIN)
 
 evaluate: $(READY)  ## fresh rounds of that run (trained first if it is missing), or of RUN=its folder
-	$(CLI) evaluate $(or $(RUN),"$$($(TRAIN) | tail -n 1)")
+	$(if $(RUN),$(CLI) evaluate $(RUN),run="$$($(TRAIN))" && $(CLI) evaluate "$$run")
 
 sweep: $(READY)  ## train and evaluate what is missing of GRID: GRID JOBS RESULTS
 	$(CLI) sweep $(GRID) --jobs $(JOBS) --out $(RESULTS)/runs

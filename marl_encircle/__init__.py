@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv
     from marl_encircle.experiments.build import make_vec_env
     from marl_encircle.experiments.loading import load_policy
+    from marl_encircle.experiments.yaml_files import ConfigError
     from marl_encircle.maddpg import MADDPG, MATD3
 
 __version__: str
@@ -24,6 +25,7 @@ __version__: str
 __all__ = [
     "MADDPG",
     "MATD3",
+    "ConfigError",
     "Reward",
     "Scenario",
     "SuperSuitVecEnv",
@@ -36,6 +38,7 @@ __all__ = [
 _HOMES = {
     "MADDPG": "maddpg",
     "MATD3": "maddpg",
+    "ConfigError": "experiments.yaml_files",
     "Reward": "core.rewards",
     "Scenario": "core.scenario",
     "SuperSuitVecEnv": "envs.supersuit_vec_env",

@@ -66,7 +66,7 @@ def test_variables_reach_the_command() -> None:
     assert shown.strip().endswith("evaluate elsewhere/seed7")
     shown = " ".join(make("-n", "evaluate", "SPEED_RATIO=1.10", "RESULTS=elsewhere").split())
     assert "--speed-ratio 1.10" in shown  # the command knows where that run lies
-    assert shown.endswith('--out elsewhere/runs | tail -n 1)"')
+    assert shown.endswith('--out elsewhere/runs)" && .venv/bin/marl-encircle evaluate "$run"')
     for target in ("tables", "figures", "verify-results"):
         shown = make("-n", target, "GRID=smoke", "RESULTS=elsewhere")
         assert shown.strip().endswith(f"{target} --grid smoke --out elsewhere")

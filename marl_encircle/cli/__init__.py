@@ -154,9 +154,9 @@ def _exit_code(error: Exception) -> int | None:
         return 1
     # These modules take seconds to import; what they raise comes from there.
     from marl_encircle.core.simulator import PlacementError
-    from marl_encircle.experiments.callbacks import Stopped
     from marl_encircle.experiments.divergence import Diverged
     from marl_encircle.experiments.export import ParityError
+    from marl_encircle.experiments.signals import Stopped
     from marl_encircle.study.calibrate import CalibrationError
 
     if isinstance(error, PlacementError):

@@ -67,6 +67,7 @@ def _versions() -> dict[str, str | None]:
 def _machine() -> dict[str, Any]:
     import torch as th
 
+    from marl_encircle.experiments.memory import available_memory
     from marl_encircle.experiments.provenance import cpu_model
 
     devices = [th.cuda.get_device_name(number) for number in range(th.cuda.device_count())]
@@ -74,7 +75,7 @@ def _machine() -> dict[str, Any]:
         "system": platform.platform(),
         "cpu": cpu_model(),
         "cores": os.cpu_count(),
-        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9),
+        "memory_gb": round(available_memory() / 1e9),
         "cuda": ", ".join(devices) or None,
     }
 
@@ -118,16 +119,18 @@ def _run_folders(results: Path | None) -> list[Path]:
 
 def _runs(folder: Path) -> dict[str, dict[str, int]]:
     """Return how many runs of each method have which end."""
-    from marl_encircle.experiments.records import RECORD, read_record
+    from marl_encircle.experiments.records import RECORD, read_record, run_folders
     from marl_encircle.files import DamagedFileError
 
     ends: dict[str, Counter[str]] = {}
-    for path in sorted(folder.glob(f"*/*/seed*/{RECORD}")):
+    for run in run_folders(folder):
+        if not (run / RECORD).exists():
+            continue
         try:
-            status = read_record(path.parent)["status"]
+            status = read_record(run)["status"]
         except DamagedFileError:
             status = "damaged"
-        ends.setdefault(path.parents[2].name, Counter())[status] += 1
+        ends.setdefault(run.parents[1].name, Counter())[status] += 1
     return {method: dict(counts) for method, counts in ends.items()}
 
 

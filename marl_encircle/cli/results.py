@@ -142,6 +142,8 @@ def _check_runs(name: str, grid: "Grid", out: Path) -> None:
     fault = f"no run of the grid {name} has ended there"
     if not runs.is_dir():
         fault = f"no such folder, so no run of the grid {name}"
+        if any(_ended_runs(grid, out)):
+            raise ConfigError(f"{runs}: {fault}; {out} holds runs itself: give --results {out.parent}")
     advice = f"train them: {shlex.join(['marl-encircle', 'sweep', name, '--out', str(runs)])}"
     if others:
         advice += f". There are others, such as {others[0]}: --grid takes the name or the YAML file of their grid"
@@ -150,10 +152,10 @@ def _check_runs(name: str, grid: "Grid", out: Path) -> None:
 
 def _ended_runs(grid: "Grid", runs: Path) -> tuple[list[Path], list[Path]]:
     """Return the runs below a folder that have ended, those that a grid asks for and the others."""
-    from marl_encircle.experiments.records import RECORD, run_path
+    from marl_encircle.experiments.records import RECORD, run_folders, run_path
 
     asked = {run_path(job.config.cell, job.seed) for job in grid.jobs}
-    ended = {path.parent.relative_to(runs) for path in runs.glob(f"[!.]*/[!.]*/seed*/{RECORD}")}
+    ended = {run.relative_to(runs) for run in run_folders(runs) if (run / RECORD).exists()}
     # Asked for one by one: glob passes over what cannot be read.
     return [run for run in asked if (runs / run / RECORD).exists()], sorted(ended - asked)
 

@@ -206,7 +206,7 @@ def evaluate(
     """
     _check_there(run_dir)
     from marl_encircle.experiments.evaluate import play_rounds
-    from marl_encircle.experiments.loading import load_run
+    from marl_encircle.experiments.loading import folder_of, load_run
     from marl_encircle.experiments.metrics import summarise_run
     from marl_encircle.experiments.records import POLICY
     from marl_encircle.experiments.train import write_episodes
@@ -248,7 +248,7 @@ def evaluate(
         "policy_sha256": record["sha256"][POLICY],
     }
     if write:
-        write_episodes(run_dir, rounds)
+        write_episodes(folder_of(run_dir), rounds)
     if as_json:
         typer.echo(json.dumps(result))
     else:

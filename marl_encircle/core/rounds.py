@@ -95,6 +95,10 @@ class Rounds:
         """sigma_c: standard deviation over the pursuers of theta_c averaged over the round (Eq. 15) [rad], (B,)."""
         return self._spread(slice(None))
 
+    def success_steps(self, world: int) -> dict[Closure, int | None]:
+        """Return the step of one round, from 1, at which each rule first held; None if it has not."""
+        return {rule: None if step[world] == NEVER else int(step[world]) for rule, step in self.success_step.items()}
+
     def summary(self, world: int) -> dict[str, float]:
         """Return one round's figures by the names under which they are logged."""
         length = max(int(self.length[world]), 1)

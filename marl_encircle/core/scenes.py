@@ -3,6 +3,7 @@
 An obstacle is a rigid set of discs that is put somewhere at some angle. A scene names that set.
 """
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -37,7 +38,8 @@ def _about_centre(x: Array, y: Array, radius: float) -> Array:
 SCENES: dict[str, Callable[[], Array]] = {"random": random, "concave": concave, "tunnel": tunnel}
 """Each scene's obstacle: discs (L, 3) as x, y, radius about their centre [obstacle radii].
 
-One's own is added by assignment, ``SCENES["cross"] = cross``, before the scenario that names it is made.
+One's own is added by assignment, ``SCENES["cross"] = cross``, before the scenario that names it is made. A name is one
+word of letters, digits and _, since folders of runs are named after it.
 """
 
 
@@ -45,8 +47,10 @@ def discs_of(scene: str) -> Array:
     """Return the discs of a scene's obstacle, (L, 3).
 
     :param scene: a name in ``SCENES``
-    :raises ValueError: if the scene's function returns anything else
+    :raises ValueError: if the name is no word, or the scene's function returns anything else
     """
+    if not re.fullmatch(r"\w+", scene):
+        raise ValueError(f"scene {scene!r:.80} must be named by letters, digits and _: folders are named after it")
     discs = np.asarray(SCENES[scene](), np.float64)
     if discs.ndim != 2 or discs.shape[1] != 3 or not len(discs):
         raise ValueError(f"scene {scene!r:.80} must return discs (x, y, radius), (L, 3); got shape {discs.shape}")

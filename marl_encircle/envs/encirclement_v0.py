@@ -38,7 +38,7 @@ def parallel_env(
     :param max_cycles: steps after which a round is truncated; the scenario's by default
     :param render_mode: None, ``human`` or ``rgb_array``
     :param scenario_fields: fields of the scenario to change, such as ``speed_ratio=1.3``
-    :raises TypeError: for what is no scenario, or a field that a scenario does not have, naming the nearest
+    :raises TypeError: for what is no scenario or reward, or a field that a scenario does not have, naming the nearest
     :raises ValueError: for a value out of range, an unknown term or render mode
     """
     if scenario is not None and not isinstance(scenario, Scenario):
@@ -49,6 +49,8 @@ def parallel_env(
             raise TypeError(f"{name:.80}: unknown scenario field{nearest(name, known)}")
     if max_cycles is not None:
         scenario_fields["max_cycles"] = max_cycles
+    if isinstance(reward, str):
+        raise TypeError(f"reward must be a Reward or weights; a method's: load_config({reward!r:.80}).reward.build()")
     if not isinstance(reward, Reward):
         reward = Reward() if reward is None else Reward(reward)
     return EncirclementEnv(replace(scenario or Scenario(), **scenario_fields), reward, render_mode)
@@ -222,7 +224,7 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
             gymnasium.logger.warn("render() draws nothing: give render_mode='human' or 'rgb_array' to parallel_env")
             return None
         renderer = _load_renderer()
-        success = {rule: int(step[0]) or None for rule, step in self._arena.rounds.success_step.items()}
+        success = self._arena.rounds.success_steps(0)
         view = renderer.view(self._arena.simulator, self.reward.closure, self._trail, success=success)
         if self.render_mode == "rgb_array":
             picture: NDArray[np.uint8] = renderer.picture(view)
@@ -247,6 +249,8 @@ class EncirclementEnv(ParallelEnv[str, Array, Array | None]):
 
     def _joint(self, actions: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the actions of all agents, (1, N, 2), or raise a ValueError that names who is wrong."""
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"actions must be a dict of agents; got {type(actions).__name__}")
         try:
             joint = np.array([actions[agent] for agent in self.agents], np.float64)
         except (KeyError, TypeError, ValueError):

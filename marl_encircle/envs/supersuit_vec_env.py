@@ -24,6 +24,10 @@ from marl_encircle.core.simulator import world_seeds
 World: TypeAlias = ParallelEnv[str, Any, Any]
 
 
+class WorldError(RuntimeError):
+    """A world tells its agents what no learner can take: too little, numbers that are not finite, ends one by one."""
+
+
 class SuperSuitVecEnv(VecEnv):
     """B worlds of N agents as B*N slots: slot = world * N + agent, agents in the order of ``possible_agents``.
 
@@ -85,7 +89,7 @@ class SuperSuitVecEnv(VecEnv):
 
         :param seed: if given, as :meth:`seed`
         :return: first observations (B*N, O)
-        :raises RuntimeError: if one is missing, does not fit its space or is not finite; names the world and the agent
+        :raises WorldError: if one is missing, does not fit its space or is not finite; names the world and the agent
         """
         # SB3VecEnvWrapper.reset does not hand its seed on.
         if seed is not None:
@@ -120,7 +124,7 @@ class SuperSuitVecEnv(VecEnv):
         """Step all worlds; those whose episode ends go on with the first observations of the next one.
 
         :return: observations (B*N, O), rewards (B*N), dones (B*N) and infos (B*N) of this step
-        :raises RuntimeError: if agents of one world end at different steps, or what the world tells one is missing, has
+        :raises WorldError: if agents of one world end at different steps, or what the world tells one is missing, has
             another shape or is not finite; names the world and the agents
         """
         actions = self._actions.reshape(self.n_worlds, self.n_agents, *self._actions.shape[1:])
@@ -182,7 +186,7 @@ class SuperSuitVecEnv(VecEnv):
         finite = np.isfinite(values)
         if not finite.all():
             slot, *place = np.argwhere(~finite)[0].tolist()
-            raise RuntimeError(f"{self._name(slot)}: {what}{place or ''} is {values[slot, *place]}; it must be finite")
+            raise WorldError(f"{self._name(slot)}: {what}{place or ''} is {values[slot, *place]}; it must be finite")
 
     def _check_shape(self, actions: Any) -> None:
         shape = self.action_space.shape or ()
@@ -231,7 +235,7 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         ended = [agent for agent in self.possible_agents if terminations[agent] or truncations[agent]]
         if 0 < len(ended) < len(self.possible_agents):
             others = [agent for agent in self.possible_agents if agent not in ended]
-            raise RuntimeError(f"world {self.index}: {ended} ended, {others} did not; all must end at the same step")
+            raise WorldError(f"world {self.index}: {ended} ended, {others} did not; all must end at the same step")
         if ended:  # MarkovVectorEnv keeps the last observations while the reset may write into the same arrays
             observations = deepcopy(observations)
         # MarkovVectorEnv writes into the world's own infos: give it copies. SB3VecEnvWrapper drops the truncations.
@@ -248,13 +252,13 @@ class _Shield(BaseParallelWrapper[str, Any, Any]):
         """Refuse what MarkovVectorEnv cannot stack, or makes something else of: a missing reward is 0 to it."""
         for what, values in told.items():
             if absent := [agent for agent in self.possible_agents if agent not in values]:
-                raise RuntimeError(f"world {self.index}: no {what} of {absent}; all must take part in every step")
+                raise WorldError(f"world {self.index}: no {what} of {absent}; all must take part in every step")
             if what in self.shapes:
                 for agent in self.possible_agents:
                     shape, expected = np.shape(values[agent]), self.shapes[what]
                     if shape != expected:
                         expectation = f"its space has {expected}" if expected else "expected a single number"
-                        raise RuntimeError(
+                        raise WorldError(
                             f"world {self.index}, agent {agent!r}: {what} has shape {shape}, {expectation}"
                         )
 

@@ -59,17 +59,25 @@ def make_vec_env(
     """
     if "n_envs" in fields:
         raise ConfigError("n_envs counts slots, one for each pursuer of each world: give n_worlds")
-    config = load_config(reward, profile=profile, scenario=scenario, fields=fields, overrides=overrides)
     _check_integer("n_worlds", n_worlds, least=1)
-    n = len(config.settings)
-    if n_worlds % n:
-        raise ConfigError(f"n_worlds must be a multiple of the {n} settings of training.settings; got {n_worlds}")
+    overrides = _with_worlds(overrides, n_worlds)
+    config = load_config(reward, profile=profile, scenario=scenario, fields=fields, overrides=overrides)
     if seed is not None:
         _check_integer("seed", seed, least=0)
     env = build_vec_env(config, n_worlds, engine, curriculum=curriculum)
     if seed is not None:
         env.seed(seed)
     return env
+
+
+def _with_worlds(overrides: Sequence[str], n_worlds: int) -> Sequence[str]:
+    """Add the number of worlds to overrides that leave it alone; what is no list is told where they are read."""
+    if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+        return overrides
+    key = "training.n_worlds"
+    if any(str(override).partition("=")[0].strip() == key for override in overrides):
+        raise ConfigError(f"{key} is an argument here: give n_worlds")
+    return [*overrides, f"{key}={n_worlds}"]
 
 
 def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, curriculum: bool = True) -> VecEnv:

@@ -1,15 +1,9 @@
-"""What happens beside a training: logs, the learning curve, checkpoints, and signals."""
+"""What happens beside a training: logs, the learning curve, checkpoints."""
 
-import csv
-import io
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -20,46 +14,14 @@ from marl_encircle import files
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.evaluate import play_rounds
+from marl_encircle.experiments.learning_curve import COLUMNS, curve_to_csv
 from marl_encircle.experiments.metrics import summarise_run
+from marl_encircle.experiments.signals import Stopped
 from marl_encircle.maddpg import MADDPG
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
 CHECKPOINT_SHARE = 0.02
 SECONDS_BETWEEN_CHECKPOINTS = 60.0
-
-
-class Stopped(Exception):  # noqa: N818 - nothing is wrong
-    """The training was asked to stop, and can go on from its checkpoint.
-
-    :param signum: by which signal
-    """
-
-    def __init__(self, signum: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(signum).name}; run the same command again to resume")
-        self.signum = signum
-
-
-@contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM instead of dying of the first; a second one ends the process as usual."""
-    caught: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield caught  # Python lets the main thread alone set handlers, so signals are its to handle
-        return
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def catch(number: int, _frame: FrameType | None) -> None:
-        caught.append(number)
-        for each, handler in former.items():
-            signal.signal(each, handler)
-
-    for number in former:
-        signal.signal(number, catch)
-    try:
-        yield caught
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 def ended_rounds(callback: BaseCallback, curriculum: CurriculumVecEnv) -> list[dict[str, Any]]:
@@ -120,7 +82,6 @@ class LearningCurve(BaseCallback):
     :param add_pictures: called at every point with the policy, the point's number and the agents' steps
     """
 
-    COLUMNS = ("world_steps", "success", "mean_episode_length", "success_all", "success_pursuers", "sigma_c")
     model: MADDPG
 
     def __init__(
@@ -157,7 +118,7 @@ class LearningCurve(BaseCallback):
         row = [self.curriculum.world_steps, own.success, own.mean_episode_length, *rates, own.sigma_c]
         self.rows.append(row)
         point = Logger(None, self.logger.output_formats)  # written at once: the training's own log comes later
-        for name, value in zip(self.COLUMNS[1:], row[1:], strict=True):
+        for name, value in zip(COLUMNS[1:], row[1:], strict=True):
             if value is not None:
                 point.record(f"eval/{name}", value)
         point.dump(self.model.num_timesteps)
@@ -167,11 +128,7 @@ class LearningCurve(BaseCallback):
 
     def write(self) -> None:
         """Write the curve so far, even if it has no points yet."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.COLUMNS)
-        writer.writerows(["" if value is None else value for value in line] for line in self.rows)
-        files.write_text(self.path, text.getvalue())
+        files.write_text(self.path, curve_to_csv(self.rows))
 
 
 class Checkpointer(BaseCallback):
@@ -180,7 +137,7 @@ class Checkpointer(BaseCallback):
     :param save: writes the checkpoint
     :param every: seconds between checkpoints; None: a minute or more, so that all of them together, the next included,
         take at most ``CHECKPOINT_SHARE`` of the training's time
-    :param caught: signals so far, see :func:`stop_signals`
+    :param caught: signals so far, see :func:`~marl_encircle.experiments.signals.stop_signals`
     :param clock: seconds since whenever
     """
 

@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from marl_encircle.core.rewards import Reward
 from marl_encircle.core.rounds import NEVER
-from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import world_seeds
 from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.build import fit_policy
@@ -36,34 +34,37 @@ def play_rounds(
     if setting is not None:
         config = config.to_play_in(setting)
         policy = fit_policy(policy, config)
-    scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
-    reward = config.reward.build()
     rounds: list[Episode] = []
     seeds = world_seeds(seed, -(-episodes // WORLDS_AT_ONCE) * WORLDS_AT_ONCE)
     for start in range(0, len(seeds), WORLDS_AT_ONCE):
-        rounds += _play(policy, scenario, reward, seeds[start : start + WORLDS_AT_ONCE], start)
+        rounds += _play(policy, config, seeds[start : start + WORLDS_AT_ONCE], start)
     return rounds[:episodes]
 
 
-def _play(
-    policy: MADDPGPolicy, scenario: Scenario, reward: Reward, seeds: Sequence[int], first_round: int
-) -> list[Episode]:
-    arena = Arena(scenario, reward, len(seeds))
+def evaluation_worlds(config: Config, seeds: Sequence[int]) -> Arena:
+    """Return worlds of these seeds that see in as many directions as evaluation asks for; they are not reset yet."""
+    scenario = replace(config.scenario, n_directions=config.evaluation.n_directions)
+    arena = Arena(scenario, config.reward.build(), len(seeds))
     arena.simulator.seed(seeds)
+    return arena
+
+
+def _play(policy: MADDPGPolicy, config: Config, seeds: Sequence[int], first_round: int) -> list[Episode]:
+    arena, max_cycles = evaluation_worlds(config, seeds), config.scenario.max_cycles
     observations = arena.reset()
-    for _ in range(scenario.max_cycles):
+    for _ in range(max_cycles):
         actions, _ = policy.predict(observations, deterministic=True)
         observations = arena.step(np.asarray(actions)).observations
     rounds = arena.rounds
     steps = np.stack(list(rounds.success_step.values()))
-    length = np.where((steps != NEVER).all(axis=0), steps.max(axis=0), scenario.max_cycles)
+    length = np.where((steps != NEVER).all(axis=0), steps.max(axis=0), max_cycles)
     sigma_c = rounds.contribution_spread
     return [
         Episode(
             round=first_round + b,
             seed=seeds[b],
-            step_all=_step(rounds.success_step["all"][b]),
-            step_pursuers=_step(rounds.success_step["pursuers"][b]),
+            step_all=rounds.success_steps(b)["all"],
+            step_pursuers=rounds.success_steps(b)["pursuers"],
             length=int(length[b]),
             return_mean=float(rounds.returns[b].mean()),
             sigma_c=float(sigma_c[b]),
@@ -72,7 +73,3 @@ def _play(
         )
         for b in range(len(seeds))
     ]
-
-
-def _step(step: np.int64) -> int | None:
-    return None if step == NEVER else int(step)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -127,7 +126,7 @@ class Grid(NamedTuple):
         return {job.config.cell for job in self.jobs} | self.aliases.keys()
 
 
-def load_grid(name: str) -> Grid:
+def load_grid(name: str | Path) -> Grid:
     """Return the runs of a grid, each once, none of a cell that shares another's.
 
     They come in the order of the seeds, else in the file's: a sweep that is stopped leaves every cell alike.
@@ -224,7 +223,7 @@ def _elsewhere(
     played = {cell: list(others) for cell, others in asked.items()}
     for job in jobs:
         for other in asked[job.config.cell]:
-            _check_playable(job, other)
+            _check_playable(job, other, "elsewhere")
     for i, entry in enumerate(entries):
         if entry.scene not in SCENES:
             raise ConfigError(f"elsewhere.{i}.scene: unknown scene {entry.scene!r:.80}{nearest(entry.scene, SCENES)}")
@@ -237,9 +236,7 @@ def _elsewhere(
                 continue
             if job.config.cell._replace(setting=other) in trained:
                 continue
-            scenario = job.config.scenario
-            if replace(scenario, scene=entry.scene).units != scenario.units:
-                raise ConfigError(f"elsewhere.{i}.scene: needs composite_unit, or an obstacle there is several here")
+            _check_playable(job, other, f"elsewhere.{i}.scene")
             others.append(other)
     _check_distinct(played)
     return {cell: tuple(others) for cell, others in played.items() if others}
@@ -261,12 +258,12 @@ def _check_distinct(played: Mapping[Cell, Iterable[Setting]]) -> None:
                 )
 
 
-def _check_playable(job: Job, other: Setting) -> None:
-    """Refuse a setting in which a job's policies cannot play."""
+def _check_playable(job: Job, other: Setting, key: str) -> None:
+    """Refuse a setting in which a job's policies cannot play; ``key`` asks for it."""
     try:
         job.config.to_play_in(other)
     except ConfigError as error:
-        raise ConfigError(f"elsewhere: {error}") from error
+        raise ConfigError(f"{key}: {error}") from error
 
 
 def _in_words(setting: Setting) -> str:

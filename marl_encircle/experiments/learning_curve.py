@@ -1,6 +1,8 @@
 """The learning curve of a run, ``progress.csv``: what its selection rounds said during the training."""
 
 import csv
+import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +13,8 @@ from marl_encircle import files
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import csv_lines
 from marl_encircle.experiments.records import CURVE, MAX_FILE
+
+COLUMNS = ("world_steps", "success", "mean_episode_length", "success_all", "success_pursuers", "sigma_c")
 
 
 class Curve(NamedTuple):
@@ -34,6 +38,18 @@ def count_points(config: Config) -> int:
     rollout = training.n_worlds * config.algorithm.train_freq
     last_beginning = (training.world_steps - 1) // rollout * rollout
     return last_beginning // training.curve_every + 1
+
+
+def curve_to_csv(rows: Iterable[Sequence[float | None]]) -> str:
+    """Write points, a line each.
+
+    :param rows: in the order of ``COLUMNS``
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(["" if value is None else value for value in row] for row in rows)
+    return text.getvalue()
 
 
 def read_curve(folder: Path, sha256: str | None = None) -> Curve:

@@ -1,7 +1,7 @@
 """Names -> files -> plain values: where methods, sections and grids lie, each file on top of the ``base`` it names.
 
-``reward`` comes from ``ablations/``, ``baselines/`` or a path; the other sections from the package's
-``configs/<section>/`` or a path.
+``reward`` comes from ``ablations/``, ``baselines/`` or a path, a grid from the package's ``configs/paper/`` or a path,
+the other kinds from ``configs/<kind>/`` or a path.
 """
 
 import os
@@ -17,9 +17,6 @@ PACKAGE = Path(__file__).parent.parent
 Kind = Literal["reward", "scenario", "algorithm", "training", "evaluation", "grid", "protocol", "tuning"]
 """What a YAML file of ours may be: a section of a configuration, or a plan of many runs."""
 
-PROTOCOLS = ("calibration",)
-"""Files of ``configs/paper/`` that are protocols; the others are grids."""
-
 MAX_BASES = 20
 MAX_NAME = 1000
 """Characters of a name or path."""
@@ -27,14 +24,9 @@ MAX_NAME = 1000
 
 def files_of(kind: Kind) -> dict[str, Path]:
     """Return the files of a kind that the installation carries, by name."""
-    if kind == "reward":
-        folders = _reward_folders()
-    else:
-        folders = [PACKAGE / "configs" / ("paper" if kind in ("grid", "protocol") else kind)]
-    found = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
-    if kind in ("grid", "protocol"):
-        found = {name: path for name, path in found.items() if (name in PROTOCOLS) == (kind == "protocol")}
-    return dict(sorted(found.items()))
+    own = PACKAGE / "configs" / ("paper" if kind == "grid" else kind)
+    folders = _reward_folders() if kind == "reward" else [own]
+    return dict(sorted((path.stem, path) for folder in folders for path in folder.glob("*.yaml")))
 
 
 def reward_names() -> list[str]:
@@ -74,11 +66,12 @@ def file_of(section: Kind, name: str, keys: Sequence[str]) -> Path | None:
     return next((path for path, values in _chain(name, section) if holds(values, keys)), None)
 
 
-def find_file(name: str, kind: Kind) -> Path:
+def find_file(name: str | Path, kind: Kind) -> Path:
     """Return the file of that kind and name, or of that path.
 
     :raises ConfigError: naming the nearest name of that kind
     """
+    name = str(name)
     if not name.isprintable() or len(name) > MAX_NAME:
         raise ConfigError(f"{kind} must be a name or the path of a YAML file; got {name!r:.80}")
     if is_path(name):

@@ -73,13 +73,11 @@ def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> Loaded
     :raises ConfigError: for a setting that the policy does not serve
     :raises DamagedFileError: if a file is missing, changed or does not fit the configuration
     """
-    folder = Path(run)
-    if folder.name == POLICY:
-        folder = folder.parent
+    folder = folder_of(run)
     if folder.is_file():
         raise files.DamagedFileError(folder, _no_run(folder))
     record = read_record(folder)
-    config = config_of(record, folder)
+    config = config_of(record, folder / RECORD)
     data = files.read_bytes(folder / POLICY, sha256=record["sha256"][POLICY], max_bytes=MAX_POLICY_BYTES)
     policy = build_policy(config)
     try:
@@ -98,6 +96,12 @@ def load_run(run: str | Path, fields: Mapping[str, Any] | None = None) -> Loaded
             raise ConfigError(f"{asked}: {error}") from error
         policy = fit_policy(policy, config)
     return LoadedRun(policy, config, record)
+
+
+def folder_of(run: str | Path) -> Path:
+    """Return the folder of a run that may be given by its ``policy.safetensors``."""
+    path = Path(run)
+    return path.parent if path.name == POLICY else path
 
 
 def load_weights(policy: MADDPGPolicy, data: bytes) -> None:
@@ -127,12 +131,14 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def config_of(record: dict[str, Any], folder: Path) -> Config:
-    """Return the configuration that the run of a folder was made with.
+def config_of(record: dict[str, Any], path: Path) -> Config:
+    """Return the configuration that a run was made with.
 
+    :param record: of the run, or of its checkpoint
+    :param path: of the file that holds it
     :raises DamagedFileError: if it is not a valid configuration
     """
     try:
         return Config.from_dict(record.get("config"))  # type: ignore[arg-type]  # it may be anything
     except (ValueError, RecursionError) as error:
-        raise files.DamagedFileError(folder / RECORD, f"config: {str(error)[:500]}") from error
+        raise files.DamagedFileError(path, f"config: {str(error)[:500]}") from error

@@ -1,7 +1,7 @@
 """MADDPG and MATD3 on any PettingZoo ParallelEnv: trained through SuperSuit, held against chance, written as a policy.
 
-The hyper-parameters are those of ``benchmarks/simple_spread.py``, chosen for MPE's ``simple_spread``: a start, not what
-another environment deserves.
+The hyper-parameters are those of ``benchmarks/simple_spread.py``, chosen for MPE's ``simple_spread``, but each agent
+has an actor of its own: a start, not what another environment deserves.
 """
 
 import json
@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 
 from marl_encircle import files
-from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
+from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World, WorldError
 from marl_encircle.experiments.build import policy_bytes
 from marl_encircle.experiments.choices import AlgorithmName
 from marl_encircle.experiments.config import MAX_CRITIC_BYTES, MAX_POLICY_BYTES
@@ -120,7 +120,7 @@ def play_with(
     try:
         model.learn(world_steps * n, callback=CallbackList([guard, *([bar] if progress_bar else [])]))
         guard.check()  # the last updates too
-    except RuntimeError as error:  # SuperSuitVecEnv's, about how rounds end
+    except WorldError as error:
         raise ConfigError(f"{name}: {error}") from error
     finally:
         bar.close()

@@ -85,6 +85,11 @@ def run_path(cell: Cell, seed: int) -> Path:
     return Path(cell.method, setting_name(cell.setting), f"seed{seed}")
 
 
+def run_folders(folder: Path) -> list[Path]:
+    """Return what lies where runs do, ``<method>/<setting>/seed<s>``; names that start with a dot are not ours."""
+    return sorted(folder.glob("[!.]*/[!.]*/seed*"))
+
+
 def setting_name(setting: Setting) -> str:
     """How folders and files spell a setting: ``ratio<lambda>_n<n>_m<m>_<scene>``."""
     ratio, pursuers, obstacles, scene = setting

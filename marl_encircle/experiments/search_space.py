@@ -188,7 +188,7 @@ def load_space(name: str | Path) -> Space:
     :raises ConfigError: naming file and key; every value that may be tried is checked too
     """
     forget_configs()
-    path = find_file(str(name), "tuning")
+    path = find_file(name, "tuning")
     values = read_yaml(path)
     for key in ("scenario", "reward", "algorithm"):
         if isinstance(values.get(key), str) and is_path(values[key]):

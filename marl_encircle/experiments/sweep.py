@@ -11,11 +11,11 @@ from statistics import mean
 from typing import Any, NamedTuple
 
 from marl_encircle import files, locks
-from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.executors import Executor, LocalExecutor, Worker
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.learning_curve import read_curve
 from marl_encircle.experiments.records import RECORD, run_path
+from marl_encircle.experiments.signals import Stopped, stop_signals
 from marl_encircle.experiments.train import ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 

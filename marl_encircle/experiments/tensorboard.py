@@ -20,7 +20,7 @@ from marl_encircle.experiments.descriptions import CURVES, describe
 from marl_encircle.experiments.episodes import csv_lines
 from marl_encircle.experiments.learning_curve import count_points
 from marl_encircle.experiments.loading import config_of
-from marl_encircle.experiments.records import CURVE, MAX_FILE, RECORD, read_record
+from marl_encircle.experiments.records import CURVE, MAX_FILE, RECORD, read_record, run_folders
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -166,7 +166,7 @@ def lay_out(runs: Path, folder: Path) -> Shown:
     :raises DamagedFileError: for a finished run that is not what its record says
     """
     recorded = own = 0
-    for run in sorted(runs.glob("*/*/seed*")):
+    for run in run_folders(runs):
         shown = folder / run.relative_to(runs)
         if any((run / "tensorboard").glob("events.out.tfevents.*")):
             shown.parent.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ def _write_curve(run: Path, folder: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     record = read_record(run)
-    config = config_of(record, run)
+    config = config_of(record, run / RECORD)
     data = files.read_bytes(run / CURVE, sha256=record["sha256"].get(CURVE), max_bytes=MAX_FILE)
     with SummaryWriter(folder) as writer:
         describe(writer, config, record["seed"], CURVES)

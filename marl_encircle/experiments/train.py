@@ -19,14 +19,7 @@ from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint, divergence
 from marl_encircle.experiments.build import build_model, build_vec_env, check_engine, policy_bytes
-from marl_encircle.experiments.callbacks import (
-    Checkpointer,
-    LearningCurve,
-    RoundLogger,
-    Stopped,
-    ended_rounds,
-    stop_signals,
-)
+from marl_encircle.experiments.callbacks import Checkpointer, LearningCurve, RoundLogger, ended_rounds
 from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config, difference
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
@@ -46,6 +39,7 @@ from marl_encircle.experiments.records import (
     read_record,
     run_path,
 )
+from marl_encircle.experiments.signals import Stopped, stop_signals
 from marl_encircle.experiments.tensorboard import Draw, EventFiles, check_tensorboard
 from marl_encircle.experiments.trainable import check_seed, check_training
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -117,7 +111,7 @@ class _Run:
         self.rows: list[list[float | None]] = []
         saved = checkpoint.load(folder)
         if saved is not None:
-            _check_same(folder, plan, saved.get("plan", {}))
+            _check_same(folder / checkpoint.NAME, plan, saved.get("plan", {}))
         self.env = build_vec_env(config, config.training.n_worlds, engine)
         self.curriculum = cast(CurriculumVecEnv, self.env.venv)  # type: ignore[attr-defined]  # the outermost is a VecMonitor
         self.model = build_model(config, self.env, seed)
@@ -271,7 +265,7 @@ def check_same_run(folder: Path, config: Config, seed: int, engine: Engine | Non
     :raises OtherRunError: if it is of another configuration, seed or engine
     """
     record = read_record(folder)
-    _check_same(folder, _plan(config, seed, engine or record.get("engine", "native")), record)
+    _check_same(folder / RECORD, _plan(config, seed, engine or record.get("engine", "native")), record)
     return record
 
 
@@ -288,11 +282,14 @@ def _plan(config: Config, seed: int, engine: Engine) -> dict[str, Any]:
     return {"config": config.to_dict(), "seed": seed, "engine": engine}
 
 
-def _check_same(folder: Path, plan: dict[str, Any], record: dict[str, Any]) -> None:
-    """Compare with what a run or a checkpoint was made with; fields that were added since have their defaults."""
-    other = _plan(config_of(record, folder), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]  # only compared, so may be anything
+def _check_same(path: Path, plan: dict[str, Any], record: dict[str, Any]) -> None:
+    """Compare with what a run or a checkpoint was made with; fields that were added since have their defaults.
+
+    :param path: of the file that holds it
+    """
+    other = _plan(config_of(record, path), record.get("seed"), record.get("engine"))  # type: ignore[arg-type]  # only compared, so may be anything
     lines = difference(plan, other)
     if lines:
         listing = "\n  ".join(lines)
         advice = "choose another --seed, --out or reward name"
-        raise OtherRunError(f"{folder} already holds a different run; {advice}:\n  {listing}")
+        raise OtherRunError(f"{path.parent} already holds a different run; {advice}:\n  {listing}")

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 from marl_encircle import files, locks
 from marl_encircle.experiments import checkpoint, sweep
-from marl_encircle.experiments.callbacks import Stopped, stop_signals
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.executors import LocalExecutor
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.learning_curve import count_points, read_curve
 from marl_encircle.experiments.records import CURVE
 from marl_encircle.experiments.search_space import Choices, Space
+from marl_encircle.experiments.signals import Stopped, stop_signals
 from marl_encircle.experiments.train import OtherRunError, ended_run, run_folder
 from marl_encircle.experiments.trainable import check_trainings
 from marl_encircle.experiments.trials import Outcome, Row, write_outcome

@@ -16,7 +16,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.env_registry.exceptions import NameNotFound, NamespaceNotFound, PettingZooRegistryError
 from pettingzoo.env_registry.registration import parallel_registry
 
-from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World
+from marl_encircle.envs.supersuit_vec_env import SuperSuitVecEnv, World, WorldError
 from marl_encircle.experiments.yaml_files import ConfigError, parse_yaml
 from marl_encircle.spelling import nearest
 
@@ -140,7 +140,10 @@ def _check_round(name: str, world: Callable[[], World]) -> None:
     """Play a round by chance: most of what would stop a training later is told now."""
     try:
         env = SuperSuitVecEnv(world)
-        act = random_actions(env.action_space)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name}: {error}") from error
+    act = random_actions(env.action_space)
+    try:
         observations = np.asarray(env.reset(seed=0))
         for _ in range(MAX_ROUND):
             stepped, _, dones, _ = env.step(act(observations))
@@ -149,9 +152,7 @@ def _check_round(name: str, world: Callable[[], World]) -> None:
                 break
         else:
             raise ConfigError(f"{name}: {NO_END}")
-    except (RuntimeError, ValueError, TypeError) as error:
-        if isinstance(error, ConfigError):
-            raise
+    except WorldError as error:
         raise ConfigError(f"{name}: {error}") from error
     env.close()
 

@@ -1,19 +1,17 @@
 """One evaluation round, played again and recorded step by step: what drawings and players of rounds show."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_encircle.core.geometry import Closure, Enclosure
-from marl_encircle.core.rounds import NEVER
 from marl_encircle.core.scenario import Scenario
 from marl_encircle.core.simulator import Simulator, world_seeds
-from marl_encircle.envs.arena import Arena
 from marl_encircle.experiments.config import Config
-from marl_encircle.experiments.evaluate import WORLDS_AT_ONCE
+from marl_encircle.experiments.evaluate import WORLDS_AT_ONCE, evaluation_worlds
 from marl_encircle.experiments.memory import available_memory, check_memory
 from marl_encircle.maddpg.policies import MADDPGPolicy
 
@@ -123,21 +121,18 @@ class Replay:
         return Snapshot.of(self.pursuers[step], self.target[step], self.discs, ratio, enclosure, step)
 
 
-def record_round(
-    policy: MADDPGPolicy, config: Config, round_number: int, eval_seed: int, scene: str | None = None
-) -> Replay:
+def record_round(policy: MADDPGPolicy, config: Config, round_number: int, eval_seed: int) -> Replay:
     """Play one evaluation round as :func:`~marl_encircle.experiments.evaluate.play_rounds` does, and record it.
 
     :param policy: whose round
     :param config: of its run
     :param round_number: number of the round within its evaluation
     :param eval_seed: evaluation seed, usually ``config.evaluation.seed``
-    :param scene: play in a scene of this name instead of the configuration's; same seed, other obstacles
     """
     # The round is played among the same others as in its evaluation, since rounding depends on the batch.
     first, world = round_number - round_number % WORLDS_AT_ONCE, round_number % WORLDS_AT_ONCE
     seeds = world_seeds(eval_seed, first + WORLDS_AT_ONCE)[first:]
-    (replay,) = _record(policy, config, seeds, [world], first, scene)
+    (replay,) = _record(policy, config, seeds, [world], first)
     return replay
 
 
@@ -146,23 +141,18 @@ def record_first_rounds(policy: MADDPGPolicy, config: Config, n: int, eval_seed:
 
     :param n: 1 to ``WORLDS_AT_ONCE``
     """
-    return _record(policy, config, world_seeds(eval_seed, WORLDS_AT_ONCE), list(range(n)), 0, None)
+    return _record(policy, config, world_seeds(eval_seed, WORLDS_AT_ONCE), list(range(n)), 0)
 
 
 def _record(
-    policy: MADDPGPolicy, config: Config, seeds: Sequence[int], worlds: list[int], first_round: int, scene: str | None
+    policy: MADDPGPolicy, config: Config, seeds: Sequence[int], worlds: list[int], first_round: int
 ) -> list[Replay]:
     """Play the rounds of a batch of worlds and record some of them, each to its own end.
 
     :raises ConfigError: if the longest that they may be would not fit into this machine's memory
     """
-    scenario = replace(
-        config.scenario, n_directions=config.evaluation.n_directions, scene=scene or config.scenario.scene
-    )
-    reward = config.reward.build()
-    arena = Arena(scenario, reward, len(seeds))
-    sim = arena.simulator
-    sim.seed(seeds)
+    arena = evaluation_worlds(config, seeds)
+    sim, scenario = arena.simulator, arena.scenario
     observations = arena.reset()
     moments = {world: [_Moment.of(sim, world)] for world in worlds}
     steps = len(worlds) * scenario.max_cycles
@@ -176,17 +166,17 @@ def _record(
         for world in playing:
             rewards[world].append(outcome.rewards[world].astype(np.float64))
             moments[world].append(_Moment.of(sim, world))
-        playing = [world for world in playing if None in _success_steps(arena, world).values()]
+        playing = [world for world in playing if None in arena.rounds.success_steps(world).values()]
         if not playing:
             break
     return [
         Replay(
             scenario=scenario,
-            closure=reward.closure,
+            closure=arena.reward.closure,
             round=first_round + world,
             seed=seeds[world],
-            step_all=_success_steps(arena, world)["all"],
-            step_pursuers=_success_steps(arena, world)["pursuers"],
+            step_all=arena.rounds.success_steps(world)["all"],
+            step_pursuers=arena.rounds.success_steps(world)["pursuers"],
             pursuers=_stack(moments[world], lambda moment: moment.pursuers),
             velocities=_stack(moments[world], lambda moment: moment.velocities),
             target=_stack(moments[world], lambda moment: moment.target),
@@ -199,12 +189,6 @@ def _record(
         )
         for world in worlds
     ]
-
-
-def _success_steps(arena: Arena, world: int) -> dict[Closure, int | None]:
-    """Return the step at which each rule first held in a world; None if it has not."""
-    steps = {rule: int(step[world]) for rule, step in arena.rounds.success_step.items()}
-    return {rule: None if step == NEVER else step for rule, step in steps.items()}
 
 
 class _Moment(NamedTuple):

@@ -1,4 +1,4 @@
-"""The choice of the study's scenario: the protocol in ``configs/paper/calibration.yaml``, carried out.
+"""The choice of the study's scenario: the protocol in ``configs/protocol/calibration.yaml``, carried out.
 
 The paper leaves fields of the scenario open. The protocol names a centre, its neighbours (each moves one field) and two
 settings of one method. Every scenario is trained in both settings with every tuning seed and stands at a distance from

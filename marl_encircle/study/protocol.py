@@ -52,10 +52,10 @@ class SuccessAndLength(NamedTuple):
     length: float
 
 
-def load_protocol(name: str) -> Protocol:
+def load_protocol(name: str | Path) -> Protocol:
     """Return a protocol, all its scenarios' configurations checked.
 
-    :param name: a name in ``configs/paper/`` or the path of a YAML file
+    :param name: a name in ``configs/protocol/`` or the path of a YAML file
     :raises ConfigError: naming file and key
     """
     forget_configs()

@@ -331,6 +331,8 @@ def test_evaluate_with_write_replaces_the_rounds_and_vouches_for_them(run: Run, 
     record = json.loads((folder / "run.json").read_text())
     assert record["sha256"]["episodes.csv"] == files.sha256_bytes((folder / "episodes.csv").read_bytes())
     assert everything_in(folder) == everything_in(finished())
+    assert run("evaluate", folder / "policy.safetensors", "--write").code == 0
+    assert everything_in(folder) == everything_in(finished())
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "9"], ["--episodes", "7"], ["--seed", "4"]])
@@ -471,6 +473,12 @@ def test_a_folder_without_runs_of_the_grid_is_refused_and_left_as_it_is(run: Run
     assert refusal() == (
         f"error: {runs}: no run of the grid smoke has ended there; {advice}. There are others, such as "
         "ours/ratio1.1_n3_m1_random/seed0: --grid takes the name or the YAML file of their grid\n"
+    )
+    done = run(name, "--grid", "smoke", "--out", runs)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        f"error: {runs / 'runs'}: no such folder, so no run of the grid smoke; {runs} holds runs itself: give "
+        f"--results {tmp_path}\n"
     )
 
 

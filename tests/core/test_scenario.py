@@ -172,6 +172,12 @@ def test_a_choice_that_is_no_text_names_the_field(value: Any) -> None:
     assert refused(scene=value).startswith("scene must be a str; got ")
 
 
+@pytest.mark.parametrize("name", ["my-cross", "my/cross", "", "a cross"])
+def test_a_scene_that_no_folder_could_be_named_after_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setitem(SCENES, name, SCENES["random"])
+    assert refused(scene=name) == f"scene {name!r} must be named by letters, digits and _: folders are named after it"
+
+
 def test_units_and_discs_count_composite_obstacles_as_told() -> None:
     whole, apart = (
         Scenario(scene="concave", obstacles=2, obstacle_radius=0.1, composite_unit=u) for u in (True, False)

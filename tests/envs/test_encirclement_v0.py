@@ -331,8 +331,8 @@ def test_an_unknown_field_is_an_error_that_names_the_nearest() -> None:
 def test_an_unknown_term_is_an_error_that_names_the_nearest() -> None:
     with pytest.raises(ValueError, match=r"terms\.overal_angle: unknown reward term; did you mean overall_angle\?"):
         parallel_env(reward={"overal_angle": 1.0})
-    with pytest.raises(ValueError, match="terms must be a mapping of terms to their weights; got 'ours'"):
-        parallel_env(reward="ours")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"terms must be a mapping of terms to their weights; got \['time'\]"):
+        parallel_env(reward=["time"])  # type: ignore[arg-type]
 
 
 def test_a_value_out_of_range_is_an_error() -> None:
@@ -392,6 +392,19 @@ def test_a_missing_action_is_refused_by_name() -> None:
         env.step({"pursuer_0": np.zeros(2), "pursuer_2": np.zeros(2)})
     with pytest.raises(ValueError, match="no action for pursuer_0; got actions for nobody"):
         env.step({})
+
+
+@pytest.mark.parametrize("actions", [np.zeros((3, 2)), [np.zeros(2)] * 3, None])
+def test_actions_that_are_no_dict_are_refused(actions: Any) -> None:
+    env = parallel_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=rf"actions must be a dict of agents; got {type(actions).__name__}"):
+        env.step(actions)
+
+
+def test_a_method_is_no_reward_and_told_where_its_reward_is() -> None:
+    with pytest.raises(TypeError, match=r"a method's: load_config\('model_b'\)\.reward\.build\(\)"):
+        parallel_env(reward="model_b")  # type: ignore[arg-type]
 
 
 def test_a_step_outside_of_a_round_is_refused() -> None:

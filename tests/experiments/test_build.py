@@ -108,6 +108,8 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
         ({"pursuers": "3"}, "scenario.pursuers must be an integer"),
         ({"reward": "our"}, "did you mean ours?"),
         ({"overrides": ["training.n_world=3"]}, "did you mean n_worlds?"),
+        ({"overrides": ["training.n_worlds=3"]}, "training.n_worlds is an argument here: give n_worlds"),
+        ({"overrides": None}, "overrides must be a list of section.key=value; got None"),
         ({"engine": "nativ"}, "engine 'nativ': unknown engine; did you mean native?"),
         ({"engine": None}, "engine None: unknown engine; known: native, supersuit"),
         ({"n_envs": 8}, "n_envs counts slots, one for each pursuer of each world: give n_worlds"),
@@ -116,7 +118,7 @@ def test_an_environment_needs_no_memory_for_a_replay_buffer() -> None:
         ({"n_worlds": 2.0}, "n_worlds must be an integer of at least 1; got 2.0"),
         (
             {"n_worlds": 5, "overrides": IN_SEVERAL_SETTINGS},
-            "n_worlds must be a multiple of the 2 settings of training.settings; got 5",
+            "training.n_worlds: must be a multiple of the 2 settings; got 5",
         ),
         ({"seed": -1}, "seed must be an integer of at least 0; got -1"),
         ({"seed": "0"}, "seed must be an integer of at least 0; got '0'"),

@@ -15,8 +15,9 @@ from tiny_runs import contents, finished, tiny
 
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import train
-from marl_encircle.experiments.callbacks import Checkpointer, Stopped, ended_rounds, stop_signals
+from marl_encircle.experiments.callbacks import Checkpointer, ended_rounds
 from marl_encircle.experiments.config import load_config
+from marl_encircle.experiments.signals import Stopped, stop_signals
 
 EASY = tiny(pursuers=5, overrides=["scenario.movement_range_limit=3.0"])
 """A setting in which beginners succeed now and then."""

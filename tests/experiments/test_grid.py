@@ -137,8 +137,10 @@ def test_a_scene_in_which_no_policy_can_play_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"elsewhere\.0\.scene: unknown scene 'tunel'; did you mean tunnel"):
         grid_of(tmp_path, text + "elsewhere: [{scene: tunel, obstacles: 1}]\n")
     (tmp_path / "split.yaml").write_text("composite_unit: false\n")
-    with pytest.raises(ConfigError, match=r"elsewhere\.0\.scene: needs composite_unit"):
-        grid_of(tmp_path, "scenario: split.yaml\n" + text + "elsewhere: [{scene: tunnel, obstacles: 1}]\n")
+    split = "scenario: split.yaml\n" + text + "elsewhere: [{scene: tunnel, obstacles: 1}]\n"
+    with pytest.raises(ConfigError, match=r"elsewhere\.0\.scene: policies of ours cannot play with other numbers"):
+        grid_of(tmp_path, split)
+    assert len(grid_of(tmp_path, split.replace("[ours, ours]", "[ours]\n    algorithm: matd3_set")).elsewhere) == 1
 
 
 SETS = """\

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import imitation
 import numpy as np
@@ -15,7 +15,7 @@ from marl_encircle.experiments.divergence import Diverged
 from marl_encircle.experiments.play_with import FIRST_ROUND, Played, load_played, play_with, save_policy
 from marl_encircle.experiments.worlds import find_world
 from marl_encircle.experiments.yaml_files import ConfigError
-from marl_encircle.maddpg import MADDPG
+from marl_encircle.maddpg import ALGORITHMS, MADDPG
 
 
 def played(algorithm: AlgorithmName = "maddpg", world_steps: int = 200, **more: Any) -> Played:
@@ -70,6 +70,10 @@ def test_rounds_that_no_longer_end_together_or_at_all_are_refused(monkeypatch: p
             module.play_returns("imitation", lambda unfit=unfit: imitation.Imitation(unfit=unfit), lambda seen: seen, 1)
     with pytest.raises(ConfigError, match=r"^imitation: world 0: .* ended, .* did not"):
         play_with("imitation", lambda: imitation.Imitation(unfit="staggered"), world_steps=200)
+
+
+def test_every_algorithm_can_be_chosen_by_its_name() -> None:
+    assert get_args(AlgorithmName) == tuple(ALGORITHMS)
 
 
 def test_a_training_that_diverges_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,11 +19,11 @@ from marl_encircle import files
 from marl_encircle.core.rewards import TERMS
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import train
-from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import Config, load_config
 from marl_encircle.experiments.descriptions import METRICS, TRAINING, hyperparameters, texts
 from marl_encircle.experiments.learning_curve import count_points
 from marl_encircle.experiments.loading import load_policy
+from marl_encircle.experiments.signals import Stopped
 from marl_encircle.experiments.tensorboard import EventFiles, Picture, is_drawn, lay_out
 from marl_encircle.maddpg.policies import MADDPGPolicy
 from marl_encircle.replays.thumbnails import thumbnails

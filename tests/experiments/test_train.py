@@ -36,11 +36,11 @@ from marl_encircle import files, locks
 from marl_encircle.core.simulator import PlacementError
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import callbacks, checkpoint, train
-from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.choices import Engine
 from marl_encircle.experiments.config import Config
 from marl_encircle.experiments.episodes import episodes_from_csv
 from marl_encircle.experiments.records import config_hash, read_record, read_runs
+from marl_encircle.experiments.signals import Stopped
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.maddpg import MADDPG, maddpg
 
@@ -528,6 +528,21 @@ def test_a_damaged_checkpoint_is_named_and_kept(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(files.DamagedFileError, match=r"checkpoint\.safetensors"):
         train.train(tiny(), 0, "native", tmp_path)
     assert path.read_bytes() == before
+
+
+def test_a_checkpoint_of_another_version_is_named_and_not_a_record_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 20)
+        with pytest.raises(Stopped):
+            train.train(tiny(), 0, "native", tmp_path)
+    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    saved = checkpoint.load_tree(path)
+    saved["plan"]["config"]["algorithm"]["later"] = 1
+    checkpoint.save_tree(path, saved)
+    with pytest.raises(files.DamagedFileError, match=r"checkpoint\.safetensors: config: algorithm\.later: unknown key"):
+        train.train(tiny(), 0, "native", tmp_path)
 
 
 # diverged

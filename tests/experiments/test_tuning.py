@@ -15,11 +15,11 @@ from tiny_runs import TINY, Trained, train_in_this_process
 
 from marl_encircle import files
 from marl_encircle.experiments import checkpoint, executors
-from marl_encircle.experiments.callbacks import Stopped
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.divergence import Diverged, DivergenceGuard
 from marl_encircle.experiments.grid import Job
 from marl_encircle.experiments.search_space import Space, load_space
+from marl_encircle.experiments.signals import Stopped
 from marl_encircle.experiments.train import OtherRunError, run_folder
 from marl_encircle.experiments.trials import Outcome, Row
 from marl_encircle.experiments.tuning import tune

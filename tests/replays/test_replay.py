@@ -113,14 +113,6 @@ def test_shapes_and_read_only_arrays() -> None:
     assert not any(array.flags.writeable for array in arrays)
 
 
-def test_another_scene_has_other_obstacles_and_the_same_seed() -> None:
-    policy, config = load_policy(finished()), tiny()
-    random, tunnel = record_round(policy, config, 1, 5), record_round(policy, config, 1, 5, "tunnel")
-    assert random.seed == tunnel.seed
-    assert (len(random.discs), len(tunnel.discs)) == (1, 10)
-    assert steps(tunnel) == steps(play_rounds(policy, tiny(scene="tunnel"), 2, 5)[1])
-
-
 def test_a_snapshot_is_measured_under_the_methods_own_rule() -> None:
     for method, rule in (("ours", "all"), ("model_a", "pursuers")):
         replay = recorded(tiny(method), 0)

@@ -1,7 +1,6 @@
 """From the runs of a grid to the files of all figures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -14,6 +13,7 @@ from marl_encircle.experiments.learning_curve import Curve, read_curve
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
 from marl_encircle.experiments.records import CURVE, Cell, Run, read_record, run_path
+from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.replays.replay import record_round
 from marl_encircle.study.cells import NOT_RUN, absences, gather
 from marl_encircle.study.figures import contributions, curves
@@ -115,19 +115,20 @@ def _column(place: Place, runs: Sequence[Run], absent: Mapping[Cell, str], folde
         reasons = [absent[cell] for cell in cells if cell in absent]
         return Column(place.title, None, note=reasons[0] if reasons else NOT_RUN)
     run = found[0]
-    policy, config, _ = load_run(folder / run_path(run.cell, run.seed))
-    rounds, evaluation, scene, notes = run.episodes, config.evaluation, place.setting.scene, []
-    if run.cell.setting.scene != scene:
-        if replace(config.scenario, scene=scene).units != config.scenario.units:
-            return Column(place.title, None, note="several obstacles")
+    try:
+        policy, config, _ = load_run(folder / run_path(run.cell, run.seed), {"scene": place.setting.scene})
+    except ConfigError:
+        return Column(place.title, None, note="several obstacles")
+    rounds, evaluation, notes = run.episodes, config.evaluation, []
+    if run.cell.setting != place.setting:
         rounds = run.elsewhere.get(place.setting) or tuple(
-            play_rounds(policy, config, evaluation.episodes, evaluation.seed, place.setting)
+            play_rounds(policy, config, evaluation.episodes, evaluation.seed)
         )
         notes.append("(trained with discs)")
     choice = choose_round(rounds, config.reward.closure)
     if choice is None:
         return Column(place.title, None, note="no round solved")
-    replay = record_round(policy, config, choice.round, evaluation.seed, scene)
+    replay = record_round(policy, config, choice.round, evaluation.seed)
     recorded = rounds[choice.round].success_step(config.reward.closure)
     if replay.success_step != recorded:  # evaluated on a processor that rounds otherwise
         notes.append(f"(step {recorded} when evaluated)")

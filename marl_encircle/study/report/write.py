@@ -9,7 +9,7 @@ from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.loading import config_of
-from marl_encircle.experiments.records import Cell, Run, read_record, read_runs, run_path
+from marl_encircle.experiments.records import RECORD, Cell, Run, read_record, read_runs, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.cells import absences, gather
 from marl_encircle.study.figures.write import read_bands
@@ -84,7 +84,7 @@ def _of_all(folder: Path) -> _Shown:
 
 
 def _check_alike(path: Path, first: Path) -> None:
-    here, there = (config_of(read_record(each), each).to_dict() for each in (path, first))
+    here, there = (config_of(read_record(each), each / RECORD).to_dict() for each in (path, first))
     lines = difference(here, there)
     if lines:
         raise ConfigError(
