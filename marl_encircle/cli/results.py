@@ -62,7 +62,7 @@ def report_command(
     name = grid or "committed"
     wanted = load_grid(name)
     asked, others = _ended_runs(wanted, out / "runs")
-    shows_all = grid is None and bool(others) and not asked
+    shows_all = grid is None and bool(asked or others) and not (asked and _are_as_asked(wanted, out / "runs"))
     if not shows_all:
         _check_runs(name, wanted, out)
         if grid is None and others:
@@ -158,6 +158,21 @@ def _ended_runs(grid: "Grid", runs: Path) -> tuple[list[Path], list[Path]]:
     ended = {run.relative_to(runs) for run in run_folders(runs) if (run / RECORD).exists()}
     # Asked for one by one: glob passes over what cannot be read.
     return [run for run in asked if (runs / run / RECORD).exists()], sorted(ended - asked)
+
+
+def _are_as_asked(grid: "Grid", runs: Path) -> bool:
+    """Whether those that a grid asks for were made as it asks."""
+    from marl_encircle.experiments.records import RECORD
+    from marl_encircle.experiments.train import OtherRunError, check_same_run, run_folder
+
+    folders = {run_folder(job.config, job.seed, runs): job for job in grid.jobs}
+    try:
+        for folder, job in folders.items():
+            if (folder / RECORD).exists():
+                check_same_run(folder, job.config, job.seed)
+    except OtherRunError:
+        return False
+    return True
 
 
 def _advance(bar: Any, done: int, total: int) -> None:

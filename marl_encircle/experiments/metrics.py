@@ -340,7 +340,10 @@ def _difference(
         left, right = values_first(first[seed]), values_second(second[seed])
         seeds.append({key: value - right[key] for key, value in left.items() if key in right})
     estimate = _estimate_if_any(seeds, bounds)
-    return None if estimate is None else Difference(*estimate)
+    if estimate is None:
+        return None
+    mean, *rest = estimate
+    return Difference(round(mean, 12) + 0.0, *rest)  # what is zero but for rounding has no sign
 
 
 def _hull(interval: Interval, *points: float, bounds: tuple[float, float] = UNBOUNDED) -> Interval:
