@@ -63,6 +63,8 @@ def report_command(
     wanted = load_grid(name)
     asked, others = _ended_runs(wanted, out / "runs")
     shows_all = grid is None and bool(asked or others) and not (asked and _are_as_asked(wanted, out / "runs"))
+    if shows_all and asked:
+        typer.echo(f"the runs are not those of the grid {name}: all are shown", err=True)
     if not shows_all:
         _check_runs(name, wanted, out)
         if grid is None and others:

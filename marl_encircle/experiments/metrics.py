@@ -342,8 +342,8 @@ def _difference(
     estimate = _estimate_if_any(seeds, bounds)
     if estimate is None:
         return None
-    mean, *rest = estimate
-    return Difference(round(mean, 12) + 0.0, *rest)  # what is zero but for rounding has no sign
+    difference = Difference(*estimate)
+    return difference._replace(mean=round(difference.mean, 12) + 0.0)  # what is zero but for rounding has no sign
 
 
 def _hull(interval: Interval, *points: float, bounds: tuple[float, float] = UNBOUNDED) -> Interval:

@@ -371,6 +371,18 @@ def test_without_a_grid_and_runs_of_the_usual_one_all_runs_are_shown(
     )
 
 
+def test_runs_that_are_not_as_the_usual_grid_asks_are_all_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(tiny(), 0, "native", tmp_path / "runs")
+    done = command(capsys, monkeypatch, "report", "--results", tmp_path)
+    assert done.code == 0
+    assert "the runs are not those of the grid committed: all are shown\n" in done.err
+    assert "1 of 1 finished" in Parsed((tmp_path / "report.html").read_text(encoding="utf-8")).words
+    done = command(capsys, monkeypatch, "report", "--results", tmp_path, "--grid", "committed")
+    assert (done.code, "already holds a different run" in done.err) == (2, True)
+
+
 @pytest.mark.usefixtures("_tiny_grid")
 def test_runs_that_the_usual_grid_leaves_out_are_told(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
