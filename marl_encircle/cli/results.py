@@ -167,9 +167,9 @@ def _are_as_asked(grid: "Grid", runs: Path) -> bool:
     from marl_encircle.experiments.records import RECORD
     from marl_encircle.experiments.train import OtherRunError, check_same_run, run_folder
 
-    folders = {run_folder(job.config, job.seed, runs): job for job in grid.jobs}
     try:
-        for folder, job in folders.items():
+        for job in grid.jobs:
+            folder = run_folder(job.config, job.seed, runs)
             if (folder / RECORD).exists():
                 check_same_run(folder, job.config, job.seed)
     except OtherRunError:

@@ -415,13 +415,18 @@ FORGETFUL: dict[str, Callable[[dict[str, Any]], object]] = {
 }  # fmt: skip
 
 
+def checkpoint_of_stopped(out: Path, monkeypatch: pytest.MonkeyPatch, step: int) -> Path:
+    """Return the checkpoint of a training that was stopped."""
+    with monkeypatch.context() as patch:
+        stop_at(patch, step)
+        with pytest.raises(Stopped):
+            train.train(tiny(), 0, "native", out)
+    return train.run_folder(tiny(), 0, out) / checkpoint.NAME
+
+
 @pytest.mark.parametrize("forgotten", FORGETFUL)
 def test_what_a_resume_leaves_out_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forgotten: str) -> None:
-    with monkeypatch.context() as patch:
-        stop_at(patch, 50)
-        with pytest.raises(Stopped):
-            train.train(tiny(), 0, "native", tmp_path)
-    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    path = checkpoint_of_stopped(tmp_path, monkeypatch, 50)
     saved = checkpoint.load_tree(path)
     FORGETFUL[forgotten](saved["training"])
     checkpoint.save_tree(path, saved)
@@ -509,11 +514,7 @@ def test_a_process_stopped_by_a_signal_leaves_what_the_next_goes_on_from(
 
 @pytest.mark.parametrize("change", ["cut", "flip", "other"])
 def test_a_damaged_checkpoint_is_named_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str) -> None:
-    with monkeypatch.context() as patch:
-        stop_at(patch, 20)
-        with pytest.raises(Stopped):
-            train.train(tiny(), 0, "native", tmp_path)
-    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    path = checkpoint_of_stopped(tmp_path, monkeypatch, 20)
     data = bytearray(path.read_bytes())
     if change == "cut":
         path.write_bytes(data[:-1])
@@ -533,11 +534,7 @@ def test_a_damaged_checkpoint_is_named_and_kept(tmp_path: Path, monkeypatch: pyt
 def test_a_checkpoint_of_another_version_is_named_and_not_a_record_that_is_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch:
-        stop_at(patch, 20)
-        with pytest.raises(Stopped):
-            train.train(tiny(), 0, "native", tmp_path)
-    path = train.run_folder(tiny(), 0, tmp_path) / checkpoint.NAME
+    path = checkpoint_of_stopped(tmp_path, monkeypatch, 20)
     saved = checkpoint.load_tree(path)
     saved["plan"]["config"]["algorithm"]["later"] = 1
     checkpoint.save_tree(path, saved)
