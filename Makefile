@@ -12,7 +12,7 @@ OBSTACLES   ?= 1
 SCENE       ?= random
 SEED        ?= 0
 JOBS        ?= $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
-GRID        ?= committed
+GRID        ?= study
 RESULTS     ?= results
 
 BIN    := .venv/bin

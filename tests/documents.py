@@ -38,7 +38,7 @@ NOT_RUN = {
     "marl-encircle tensorboard": "serves until it is stopped; tests/cli/test_tensorboard_command.py has one",
     "pip install ": "installs elsewhere",
     "ray start ": "starts a cluster; tests/experiments/test_ray_executor.py has one",
-    "marl-encircle sweep all --jobs 64 --executor ray": "needs that cluster",
+    "marl-encircle sweep study --jobs 64 --executor ray": "needs that cluster",
     "marl-encircle tune ": "trains for hours; tests/experiments/test_tuning.py has small ones",
 }
 """Beginnings of the commands that are not run, and why."""
@@ -190,7 +190,7 @@ class Session:
             return
         assert program == "marl-encircle", f"{self.page}: {line} is neither run nor in NOT_RUN"
         Path("few.yaml").write_text(FEW, encoding="utf-8")
-        words = ["few.yaml" if word in ("committed", "all") else word for word in words]
+        words = ["few.yaml" if word == "study" else word for word in words]
         if words[0] == "watch" and not {"--save", "--headless"} & set(words):
             words += ["--save", "window.gif"]
         if self.changed is not None and words[0] == "train":

@@ -76,7 +76,7 @@ GridOption = Annotated[
     typer.Option(
         metavar="GRID",
         autocompletion=names_of("grid"),
-        help="Whose runs: committed, smoke, all, or the path of a YAML file.",
+        help="Whose runs: study, smoke, or the path of a YAML file.",
     ),
 ]
 Out = Annotated[

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marl_encircle.experiments.grid import Grid
 
 
-def tables(grid: GridOption = "committed", out: Results = Path("results")) -> None:
+def tables(grid: GridOption = "study", out: Results = Path("results")) -> None:
     """Render the tables from the existing runs."""
     from marl_encircle.experiments.grid import load_grid
 
@@ -32,7 +32,7 @@ def tables(grid: GridOption = "committed", out: Results = Path("results")) -> No
         typer.echo(str(path))
 
 
-def figures(grid: GridOption = "committed", out: Results = Path("results")) -> None:
+def figures(grid: GridOption = "study", out: Results = Path("results")) -> None:
     """Draw Figures 1 and 3 to 6 from the runs there are."""
     from marl_encircle.experiments.grid import load_grid
 
@@ -50,8 +50,8 @@ def report_command(
         typer.Option(
             metavar="GRID",
             autocompletion=names_of("grid"),
-            help="Whose runs: committed, smoke, all, or the path of a YAML file.",
-            show_default="committed; all runs where it has none",
+            help="Whose runs: study, smoke, or the path of a YAML file.",
+            show_default="study; all runs where it has none",
         ),
     ] = None,
     out: Results = Path("results"),
@@ -59,7 +59,7 @@ def report_command(
     """Write report.html: tables, learning curves and a player of rounds, in one file that needs no network."""
     from marl_encircle.experiments.grid import load_grid
 
-    name = grid or "committed"
+    name = grid or "study"
     wanted = load_grid(name)
     asked, others = _ended_runs(wanted, out / "runs")
     shows_all = grid is None and bool(asked or others) and not (asked and _are_as_asked(wanted, out / "runs"))
@@ -77,7 +77,7 @@ def report_command(
 
 
 def reproduce_tables(
-    grid: GridOption = "committed",
+    grid: GridOption = "study",
     jobs: Jobs = 1,
     executor: ExecutorOption = "local",
     address: Address = None,
@@ -105,7 +105,7 @@ def reproduce_tables(
 
 
 def verify_results(
-    grid: GridOption = "committed", out: Results = Path("results"), quiet: Quiet = False, as_json: AsJson = False
+    grid: GridOption = "study", out: Results = Path("results"), quiet: Quiet = False, as_json: AsJson = False
 ) -> None:
     """Play every committed policy's rounds again, make tables and figures again, and compare. Nothing is written.
 

@@ -14,7 +14,7 @@ from marl_encircle.cli.printing import exit_if_failed, print_pairs
 def sweep_command(
     grid: Annotated[
         str,
-        typer.Argument(autocompletion=names_of("grid"), help="committed, smoke, all, or the path of a YAML file."),
+        typer.Argument(autocompletion=names_of("grid"), help="study, smoke, or the path of a YAML file."),
     ],
     jobs: Jobs = 1,
     executor: ExecutorOption = "local",

@@ -85,7 +85,7 @@ def first_run(cell: Cell, folders: Sequence[Path]) -> Path | None:
     :raises DamagedFileError: if its record is not what a run writes
     """
     for folder in folders:
-        found = _first_seed(folder, cell) or _first_seed(folder, load_grid("all").aliases.get(cell, cell))
+        found = _first_seed(folder, cell) or _first_seed(folder, load_grid("study").aliases.get(cell, cell))
         if found is not None:
             _check_not_diverged(found, cell)
             return found

@@ -29,7 +29,7 @@ DESK, PHONE = (1280, 900), (360, 740)
 @pytest.fixture(scope="session")
 def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results") / "report.html"
-    files.write_text(path, report(load_grid("committed"), RUNS))
+    files.write_text(path, report(load_grid("study"), RUNS))
     return path
 
 

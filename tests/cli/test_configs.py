@@ -56,7 +56,7 @@ def test_config_diff_compares_any_two_of_one_kind(run: Run, tmp_path: Path) -> N
     found = json.loads(run("config", "diff", "maddpg", "matd3_relative", "--json").out)
     assert found["algorithm.n_steps"] == [1, 3]
     assert found["algorithm.features"] == ["observation", "relative"]
-    found = json.loads(run("config", "diff", "committed", "smoke", "--json").out)
+    found = json.loads(run("config", "diff", "study", "smoke", "--json").out)
     assert found["profile"] == ["full", "smoke"]
     assert found["seeds.ours/ratio1.1_n3_m1_random"] == [[0, 1, 2, 3, 4], [900]]
     found = json.loads(run("config", "diff", "full", "smoke", "--json").out)

@@ -149,9 +149,7 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
     monkeypatch.setattr(write, "write_figures", lambda *_: ["results/figures/figure1.svg"])
     monkeypatch.setattr(tensorboard, "_serve", lambda *_: 0)
     monkeypatch.setattr(machine, "subprocess", SimpleNamespace(run=lambda *_, **__: SimpleNamespace(returncode=0)))
-    arguments = shlex.split(
-        example.replace("--grid committed", "--grid smoke").replace("sweep committed", "sweep smoke")
-    )
+    arguments = shlex.split(example.replace("--grid study", "--grid smoke").replace("sweep study", "sweep smoke"))
     if arguments[0] == "tune":
         pytest.importorskip("optuna")
         search_file(Path.cwd()).rename("my_search.yaml")
@@ -189,8 +187,8 @@ def test_every_example_works(checkout: Run, monkeypatch: pytest.MonkeyPatch, exa
         ("train --engine n", ["native"]),
         ("watch o", ["ours", "ours_plus"]),
         ("watch --versus o", ["ours", "ours_plus"]),
-        ("sweep ", ["all", "committed", "smoke"]),
-        ("tables --grid s", ["smoke"]),
+        ("sweep ", ["smoke", "study"]),
+        ("tables --grid st", ["study"]),
         ("calibrate ", ["calibration"]),
         ("tune ", ["default"]),
         ("config validate p", ["paper"]),

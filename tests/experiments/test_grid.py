@@ -11,7 +11,7 @@ from marl_encircle.experiments import train as training
 from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.grid import Grid, Job, arguments, load_grid
 from marl_encircle.experiments.pretrained import pretrained_runs
-from marl_encircle.experiments.records import RECORD, Cell, Setting
+from marl_encircle.experiments.records import RECORD, Cell, Setting, run_folders
 from marl_encircle.experiments.train import run_folder
 from marl_encircle.experiments.yaml_files import ConfigError
 from marl_encircle.study.paper import paper_results
@@ -29,17 +29,8 @@ def test_the_smoke_grid_is_two_tiny_cells() -> None:
     assert load_grid("smoke") == Grid((Job("ours", ONE, 900, "smoke"), Job("ma2019", ONE, 900, "smoke")), {})
 
 
-def test_the_committed_grid_is_all_of_the_study_that_there_are_runs_of() -> None:
-    committed, study = load_grid("committed"), load_grid("all")
-    assert (committed.cells, committed.elsewhere) == (study.cells, study.elsewhere)
-    assert (committed.frozen, committed.aliases) == (study.frozen, study.aliases)
-    there = [job for job in study.jobs if (run_folder(job.config, job.seed, pretrained_runs()) / RECORD).exists()]
-    assert set(committed.jobs) == set(there)
-    assert {job.reward for job in study.jobs if job not in there} <= {"ours_plus"}
-
-
 def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
-    grid = load_grid("all")
+    grid = load_grid("study")
     cells = {job.config.cell for job in grid.jobs} | grid.aliases.keys()
     asked = {cell for table in paper_results().values() for cell in table}
     assert len({cell.setting for cell in asked}) == 10
@@ -48,8 +39,14 @@ def test_the_study_covers_every_cell_of_the_papers_tables() -> None:
     assert {job.seed for job in grid.jobs}.isdisjoint({900, 901, 902})
 
 
+def test_every_run_of_the_study_comes_with_the_repository() -> None:
+    grid = load_grid("study")
+    asked = {run_folder(job.config, job.seed, pretrained_runs()) for job in grid.jobs}
+    assert asked == {run for run in run_folders(pretrained_runs()) if (run / RECORD).exists()}
+
+
 def test_what_goes_beyond_the_paper_has_the_settings_seeds_and_rounds_of_the_study() -> None:
-    jobs = load_grid("all").jobs
+    jobs = load_grid("study").jobs
     ours, beyond = ([job for job in jobs if job.reward == reward] for reward in ("ours", "ours_plus"))
     assert {(job.setting, job.seed) for job in beyond} == {(job.setting, job.seed) for job in ours}
     for job in beyond:
@@ -62,7 +59,7 @@ def test_what_goes_beyond_the_paper_has_the_settings_seeds_and_rounds_of_the_stu
 
 
 def test_one_policy_is_trained_and_played_in_the_settings_of_the_study() -> None:
-    grid = load_grid("all")
+    grid = load_grid("study")
     (job,) = (job for job in grid.jobs if job.reward == "generalist")
     settings = {job.setting for job in grid.jobs if job.reward == "ours"}
     assert set(job.config.settings) == settings
@@ -74,10 +71,9 @@ def test_one_policy_is_trained_and_played_in_the_settings_of_the_study() -> None
 
 def test_without_obstacles_model_a_has_the_runs_of_ours() -> None:
     setting = Setting(1.1, 3, 0)
-    for name in ("committed", "all"):
-        grid = load_grid(name)
-        assert grid.aliases[Cell("model_a", setting)] == Cell("ours", setting)
-        assert Cell("model_a", setting) not in {job.config.cell for job in grid.jobs}
+    grid = load_grid("study")
+    assert grid.aliases[Cell("model_a", setting)] == Cell("ours", setting)
+    assert Cell("model_a", setting) not in {job.config.cell for job in grid.jobs}
 
 
 GRID = """profile: smoke
@@ -115,7 +111,7 @@ def test_policies_are_played_in_the_scenes_that_a_grid_names(tmp_path: Path) -> 
     assert grid_of(tmp_path, text % 1).elsewhere == {OURS: (ONE._replace(scene="concave"),)}
     with pytest.raises(ConfigError, match=r"grid\.yaml: elsewhere\.0\.obstacles: no setting has 2"):
         grid_of(tmp_path, text % 2)
-    study = {cell: others for cell, others in load_grid("all").elsewhere.items() if cell.method != "generalist"}
+    study = {cell: others for cell, others in load_grid("study").elsewhere.items() if cell.method != "generalist"}
     assert {cell.setting.obstacles for cell in study} == {1}
     assert {len(others) for others in study.values()} == {2}
 
@@ -207,7 +203,7 @@ def test_no_cell_has_rounds_of_two_trainings(tmp_path: Path, text: str, pursuers
 
 
 def test_the_cells_of_a_grid_are_those_that_have_or_share_runs() -> None:
-    grid = load_grid("all")
+    grid = load_grid("study")
     assert len(grid.cells) == 55
     assert Cell("model_a", Setting(1.1, 3, 0)) in grid.cells
 
@@ -346,8 +342,8 @@ def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:
     ("name", "reason"),
     [
         ("al", "did you mean all?"),
-        ("nope", "known: all, committed, smoke"),
-        ("calibration", "known: all, committed, smoke"),
+        ("nope", "known: smoke, study"),
+        ("calibration", "known: smoke, study"),
         ("absent.yaml", "No such file"),
     ],
 )
@@ -375,7 +371,7 @@ def test_a_job_on_the_command_line_is_the_same_run(monkeypatch: pytest.MonkeyPat
 
 
 def test_the_first_seeds_of_all_cells_come_first() -> None:
-    jobs = load_grid("all").jobs
+    jobs = load_grid("study").jobs
     assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
     first = [job.config.cell for job in jobs if job.seed == 0]
     assert set(first) == {job.config.cell for job in jobs}

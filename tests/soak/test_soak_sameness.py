@@ -76,7 +76,7 @@ def test_tables_and_figures_can_be_derived_again(out: Path, tmp_path: Path, prom
     shutil.copytree(ROOT / "results" / "runs", tmp_path / "committed" / "runs")
     for command in DERIVED:
         marl_encircle(tmp_path, command, "--grid", out.parent / "grid.yaml", "--out", tmp_path / "swept")
-    marl_encircle(tmp_path, "tables", "--grid", "committed", "--out", tmp_path / "committed")
+    marl_encircle(tmp_path, "tables", "--grid", "study", "--out", tmp_path / "committed")
     pairs = [(contents(out, *DERIVED), contents(tmp_path / "swept", *DERIVED))]
     pairs += [(contents(ROOT / "results", "tables"), contents(tmp_path / "committed", "tables"))]
     differ = [name for one, other in pairs for name in one.keys() | other.keys() if one.get(name) != other.get(name)]

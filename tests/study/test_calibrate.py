@@ -174,7 +174,7 @@ def test_the_studys_scenario_is_the_calibrations_outcome() -> None:
     assert load_config("ours", scenario="paper") == chosen
     assert load_config("ours") == chosen, "what learns without naming a scenario does so in the study's"
     assert load_config("ours", scenario="centre") != chosen
-    assert {job.scenario for job in grids.load_grid("all").jobs} == {"paper"}
+    assert {job.scenario for job in grids.load_grid("study").jobs} == {"paper"}
 
 
 def test_the_table_of_the_calibration_follows_from_its_trainings(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_the_table_of_the_calibration_follows_from_its_trainings(tmp_path: Path)
 
 
 def test_a_grid_is_no_protocol() -> None:
-    for name in ("all", "calibratio"):
+    for name in ("study", "calibratio"):
         with pytest.raises(ConfigError, match=r"neither a known name.*(known: calibration$|mean calibration\?)"):
             load_protocol(name)
 

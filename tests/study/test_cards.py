@@ -116,7 +116,7 @@ def test_cards_are_written_with_the_tables(tmp_path: Path) -> None:
 
 
 def test_every_committed_policy_that_is_found_by_name_has_the_card_that_it_would_get_now() -> None:
-    grid = load_grid("committed")
+    grid = load_grid("study")
     cards = render_cards(grid, runs_of(grid, RUNS), RUNS)
     assert cards == {path.relative_to(RUNS).as_posix(): path.read_text() for path in RUNS.rglob(CARD)}
     found = set()

@@ -377,9 +377,9 @@ def test_runs_that_are_not_as_the_usual_grid_asks_are_all_shown(
     train(tiny(), 0, "native", tmp_path / "runs")
     done = command(capsys, monkeypatch, "report", "--results", tmp_path)
     assert done.code == 0
-    assert "the runs are not those of the grid committed: all are shown\n" in done.err
+    assert "the runs are not those of the grid study: all are shown\n" in done.err
     assert "1 of 1 finished" in Parsed((tmp_path / "report.html").read_text(encoding="utf-8")).words
-    done = command(capsys, monkeypatch, "report", "--results", tmp_path, "--grid", "committed")
+    done = command(capsys, monkeypatch, "report", "--results", tmp_path, "--grid", "study")
     assert (done.code, "already holds a different run" in done.err) == (2, True)
 
 
@@ -392,8 +392,8 @@ def test_runs_that_the_usual_grid_leaves_out_are_told(
     shutil.copytree(runs / "runs", tmp_path / "runs")
     assert "left out" not in command(capsys, monkeypatch, "report", "--results", tmp_path).err
     train(tiny(), 7, "native", tmp_path / "runs")
-    for arguments, told in (((), True), (("--grid", "committed"), False)):
+    for arguments, told in (((), True), (("--grid", "study"), False)):
         done = command(capsys, monkeypatch, "report", "--results", tmp_path, *arguments)
-        said = "left out: 1 run that the grid committed does not ask for, such as ours/ratio1.1_n3_m1_random/seed7\n"
+        said = "left out: 1 run that the grid study does not ask for, such as ours/ratio1.1_n3_m1_random/seed7\n"
         assert (done.code, said in done.err) == (0, told)
     assert "1 of 2 finished" in Parsed((tmp_path / "report.html").read_text(encoding="utf-8")).words
