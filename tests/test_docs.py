@@ -175,11 +175,25 @@ def test_notebooks_are_kept_without_outputs(notebook: Path) -> None:
     assert [cell["id"] for cell in cells if cell["outputs"] or cell["execution_count"] is not None] == []
 
 
-def test_the_drawings_are_those_that_the_script_makes() -> None:
-    sys.path.insert(0, str(DOCS))
-    try:
-        import drawings
-    finally:
-        sys.path.remove(str(DOCS))
+def test_the_drawings_are_those_that_the_script_makes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(DOCS)
+    import drawings
+
     for file, data in drawings.drawings().items():
         assert (DOCS / "images" / file).read_bytes() == data, f"python docs/drawings.py draws another {file}"
+
+
+def test_the_page_of_the_results_has_the_numbers_that_the_script_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(DOCS)
+    import findings
+
+    page = " ".join((DOCS / "reproduction.md").read_text(encoding="utf-8").split())
+    found = {title.partition(":")[0]: lines for title, lines in findings.findings(findings.read_results()).items()}
+    intervals = [*found["From none to three obstacles, paired by training seed"], *found["Where Eq. 6 fails"]]
+    assert len(intervals) == 4 + 4
+    for line in intervals:
+        [interval] = re.findall(r"(-?[\d.]+ \[-?[\d.]+, -?[\d.]+\]);", line)
+        assert interval in page, line
+    hours = "\n".join(found["Processor time"])
+    for folder, number in re.findall(r"(runs|former), the study: ([\d.]+) hours", hours):
+        assert f"{float(number):.1f} hours" in page, folder

@@ -55,7 +55,7 @@ class Choice(NamedTuple):
 
     round: int
     with_obstacle: int
-    """Solved rounds in which the obstacles were needed: at success the pursuers alone did not enclose the target."""
+    """Solved rounds in which the pursuers alone did not yet enclose the target at success."""
     solved: int
     played: int
 
@@ -72,7 +72,7 @@ class Column(NamedTuple):
 
 
 def choose_round(episodes: Sequence[Episode], closure: Closure) -> Choice | None:
-    """Return the round to draw, by rule: of median length among the solved ones that needed an obstacle.
+    """Return the round to draw, by rule: of median length among those that an obstacle helped to solve.
 
     Among all solved ones if none did. Of two in the middle the shorter one, of equally long ones the first.
 
@@ -83,12 +83,13 @@ def choose_round(episodes: Sequence[Episode], closure: Closure) -> Choice | None
     solved = [episode for episode in episodes if episode.success_step(closure) is not None]
     if not solved:
         return None
-    needed = [episode for episode in solved if _needed_obstacle(episode, closure)]
-    lengths = sorted((episode.success_step(closure) or 0, episode.round) for episode in needed or solved)
-    return Choice(lengths[(len(lengths) - 1) // 2][1], len(needed), len(solved), len(episodes))
+    helped = [episode for episode in solved if _obstacle_helped(episode, closure)]
+    lengths = sorted((episode.success_step(closure) or 0, episode.round) for episode in helped or solved)
+    return Choice(lengths[(len(lengths) - 1) // 2][1], len(helped), len(solved), len(episodes))
 
 
-def _needed_obstacle(episode: Episode, closure: Closure) -> bool:
+def _obstacle_helped(episode: Episode, closure: Closure) -> bool:
+    """Whether the pursuers alone closed the circle later, or never."""
     later = episode.step_pursuers
     return closure == "all" and episode.step_all is not None and (later is None or later > episode.step_all)
 
@@ -126,7 +127,7 @@ def _in_words(column: Column) -> str:
     choice, replay = column.choice, column.replay
     if choice is None or replay is None:
         return column.note
-    rounds = f"{choice.with_obstacle} of {choice.solved} solved rounds\nneeded the obstacle"
+    rounds = f"{choice.with_obstacle} of {choice.solved} solved rounds\nclosed first with the obstacle"
     if replay.scenario.obstacles == 0:
         rounds = f"{choice.solved} of {choice.played} rounds solved"
     return f"{rounds}\n{column.note}".rstrip()

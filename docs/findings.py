@@ -1,0 +1,270 @@
+"""Print the numbers of reproduction.md and protocol.md that no table shows: python docs/findings.py.
+
+They come from what lies in results/: nothing is trained or played. Shares are in %, their differences in points,
+lengths in steps; brackets hold 95 % intervals, Student's t over the training seeds unless another is named.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import combinations, permutations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from marl_encircle.core.geometry import Closure
+from marl_encircle.experiments import metrics
+from marl_encircle.experiments.grid import load_grid
+from marl_encircle.experiments.learning_curve import read_curve
+from marl_encircle.experiments.records import Cell, Run, Setting, read_record, read_runs, run_path
+from marl_encircle.study.agreement import PAPER_ROUNDS, gaps_of, pairs_of
+from marl_encircle.study.cells import CellRuns, gather, pursuers_suffice, run_elsewhere
+from marl_encircle.study.paper import TABLE_METHODS, label, reported_cells
+
+Array = NDArray[np.float64]
+
+RESULTS = Path(__file__).parents[1] / "results"
+STUDY = (*TABLE_METHODS, "model_c")
+CHOSE_THE_SCENARIO = (Cell("ours", Setting(1.1, 3, 0)), Cell("ours", Setting(1.1, 2, 1)))
+
+
+class Results(NamedTuple):
+    """What the sections are made from.
+
+    :param runs: the runs of the study
+    :param former: those of half the budget that they replaced
+    :param cells: the runs of each cell
+    """
+
+    runs: Sequence[Run]
+    former: Sequence[Run]
+    cells: Mapping[Cell, CellRuns]
+
+
+def main() -> None:
+    """Print every section."""
+    for title, lines in findings(read_results()).items():
+        print(title, "", *(f"  {line}" for line in lines), "", sep="\n")
+
+
+def read_results() -> Results:
+    """Read the runs of the study."""
+    grid = load_grid("study")
+    runs = [run for run in read_runs(RESULTS / "runs") if run.cell in grid.cells]
+    return Results(runs, read_runs(RESULTS / "former", policies=False), gather(runs, grid.aliases))
+
+
+def findings(results: Results) -> dict[str, Iterator[str]]:
+    """Return the title of each section, and its lines, which are found when they are asked for."""
+    return {str(section.__doc__): section(results) for section in _SECTIONS}
+
+
+def _seeds(results: Results) -> Iterator[str]:
+    """S and MEL of every training seed"""
+    for cell, runs in _own(results):
+        successes, lengths = _successes(runs), _lengths(runs)
+        yield f"{_named(cell)}: {successes.mean():.2f} of {_listed(successes)}; {_listed(lengths)}"
+
+
+def _losses(results: Results) -> Iterator[str]:
+    """From none to three obstacles, paired by training seed: loss in S; MEL with none and with three"""
+    for method in TABLE_METHODS:
+        none, three = (results.cells[Cell(method, Setting(1.1, 3, m))] for m in (0, 3))
+        lengths = np.array([np.nanmean(_lengths(runs)) for runs in (none, three)])
+        yield f"{label(method)}: {_paired(_successes(none), _successes(three))}; {_listed(lengths)}"
+
+
+def _counting(results: Results) -> Iterator[str]:
+    """What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1"""
+    for method in ("ma2019", "model_a"):
+        for m in (1, 2, 3):
+            runs = results.cells[Cell(method, Setting(1.1, 3, m))]
+            yield f"{label(method)}, m={m}: {(_successes(runs, 'all') - _successes(runs)).mean():+.2f}"
+
+
+def _help(results: Results) -> Iterator[str]:
+    """Wins of Ours in which the circle closed first with the obstacle, and never without, one obstacle at ratio 1.1"""
+    for n in (2, 3, 4, 5):
+        seeds = results.cells[Cell("ours", Setting(1.1, n, 1))].finished.values()
+        won = [episode for rounds in seeds for episode in rounds if episode.step_all is not None]
+        first = sum(episode.step_pursuers != episode.step_all for episode in won)
+        never = sum(episode.step_pursuers is None for episode in won)
+        yield f"n={n}: {100 * first / len(won):.1f} %, {100 * never / len(won):.1f} % of {len(won)}"
+
+
+def _slowness(results: Results) -> Iterator[str]:
+    """Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval"""
+    for setting in sorted({cell.setting for cell in results.cells if not pursuers_suffice(cell.setting)}):
+        ours, other = (_lengths(results.cells[Cell(method, setting)]) for method in ("ours", "model_b"))
+        yield f"{setting.symbols}: {_paired(ours, other)}; {_welch(ours, other)}"
+
+
+def _rises(results: Results) -> Iterator[str]:
+    """Rise of the learning curves over the last two fifths, over the last two tenths"""
+    for cell, runs in _own(results):
+        mean = _curves(cell, runs).mean(axis=0)
+        parts = (len(mean) // 5, len(mean) // 10)
+        rise = [mean[-points:].mean() - mean[-2 * points : -points].mean() for points in parts]
+        yield f"{_named(cell)}: {rise[0]:+.1f}, {rise[1]:+.1f}"
+
+
+def _speed(results: Results) -> Iterator[str]:
+    """Million world-steps until the mean curve has 80 %; the same without the latest seed"""
+    for m in (0, 1):
+        for method in ("model_b", "ma2019", "ours"):
+            cell = Cell(method, Setting(1.1, 3, m))
+            seeds = _curves(cell, results.cells[cell])
+            latest = np.argmax([_first_at_80(seed) for seed in seeds])
+            others = np.delete(seeds, latest, axis=0).mean(axis=0)
+            yield f"{_named(cell)}: {_first_at_80(seeds.mean(axis=0)):.2f}; {_first_at_80(others):.2f}"
+
+
+def _scenes(results: Results) -> Iterator[str]:
+    """Other shapes of obstacles: S of Model B, Ours and Ours+; Ours+ minus Ours; Ours with half the budget and since"""
+    for scene in ("concave", "tunnel"):
+        then, now = (gather(_played_in(scene, runs), {}) for runs in (results.former, results.runs))
+        for cell in (cell for cell in now if cell.method == "ours"):
+            b, ours, plus = (_successes(now[cell._replace(method=name)]) for name in ("model_b", "ours", "ours_plus"))
+            means = ", ".join(f"{successes.mean():.1f}" for successes in (b, ours, plus))
+            half = _successes(then[cell]) if cell in then else None
+            since = f"; {half.mean():.1f}, {_paired(ours, half)}" if half is not None else ""
+            yield f"{scene}, {cell.setting.symbols}: {means}; {_paired(plus, ours)}{since}"
+
+
+def _nearness(results: Results) -> Iterator[str]:
+    """S minus the paper's, held-out cells unless said: mean of the amounts, mean"""
+    gaps = gaps_of(results.cells, reported_cells())
+    chose = [gap for gap in gaps if gap.cell in CHOSE_THE_SCENARIO]
+    held_out = [gap for gap in gaps if gap not in chose and not results.cells[gap.cell].runs_of]
+    alone = [gap for gap in held_out if pursuers_suffice(gap.cell.setting)]
+    groups = {
+        "the two cells that chose the scenario": chose,
+        "all": held_out,
+        "three pursuers, Eq. 6 holds": [gap for gap in alone if gap.cell.setting.pursuers == 3],
+        "four and five pursuers": [gap for gap in alone if gap.cell.setting.pursuers > 3],
+        "Eq. 6 fails": [gap for gap in held_out if gap not in alone],
+    }
+    for name, group in groups.items():
+        gap = np.array([gap.success for gap in group])
+        yield f"{name}: {np.abs(gap).mean():.2f}, {gap.mean():+.2f} of {len(gap)}"
+
+
+def _distances(results: Results) -> Iterator[str]:
+    """Where Eq. 6 holds: how far a difference of two methods is from the paper's; can the noise of both be why"""
+    paper = reported_cells()
+    for pair in pairs_of(results.cells, paper):
+        if pair.ours.interval is None or not pursuers_suffice(pair.first.setting):
+            continue
+        shares = [paper[cell].success_percent or 0.0 for cell in (pair.first, pair.second)]
+        noise = 1.96 * math.sqrt(sum(share * (100 - share) for share in shares) / PAPER_ROUNDS)
+        half = 50 * (pair.ours.interval.high - pair.ours.interval.low)
+        distance = 100 * pair.ours.mean - pair.paper
+        verdict = "no" if abs(distance) > math.hypot(noise, half) else "yes"
+        yield f"{_named(pair.first)} minus {label(pair.second.method)}: {distance:+.1f}, {verdict}"
+
+
+def _pairings(results: Results) -> Iterator[str]:
+    """Differences in S that some of the 120 pairings of seeds show: do the tables, how many do; Welch's interval"""
+    for setting in sorted({cell.setting for cell in results.cells}):
+        cells = [Cell(method, setting) for method in reversed(STUDY)]
+        whole = [cell for cell, runs in _own(results) if cell in cells and len(runs.finished) == 5]
+        for first, second in combinations(sorted(whole, key=cells.index), 2):
+            one, other = results.cells[first], results.cells[second]
+            shown = [_is_shown(one, other, order) for order in permutations(other.finished)]
+            if 0 < sum(shown) < len(shown):
+                tables = "shown" if shown[0] else "not shown"
+                welch = _welch(_successes(one), _successes(other))
+                yield f"{_named(first)} minus {label(second.method)}: {tables}, {sum(shown)}; {welch}"
+
+
+def _hours(_: Results) -> Iterator[str]:
+    """Processor time"""
+    groups = {"the study": STUDY, "Ours+": ("ours_plus",), "the one policy": ("generalist",)}
+    for folder in ("runs", "former"):
+        records = [read_record(path.parent) for path in sorted((RESULTS / folder).glob("*/*/*/run.json"))]
+        for name, methods in groups.items():
+            hours = [record["cpu_seconds"] / 3600 for record in records if record["method"] in methods]
+            yield f"{folder}, {name}: {sum(hours):.2f} hours, {len(hours)} runs"
+
+
+_SECTIONS: tuple[Callable[[Results], Iterator[str]], ...] = (
+    _seeds,
+    _losses,
+    _counting,
+    _help,
+    _slowness,
+    _rises,
+    _speed,
+    _scenes,
+    _nearness,
+    _distances,
+    _pairings,
+    _hours,
+)
+
+
+def _own(results: Results) -> Iterator[tuple[Cell, CellRuns]]:
+    """The cells that show no other cell's runs."""
+    return ((cell, runs) for cell, runs in results.cells.items() if not runs.runs_of)
+
+
+def _played_in(scene: str, runs: Sequence[Run]) -> list[Run]:
+    """What policies played in another scene, as runs of that."""
+    return [run_elsewhere(run, setting) for run in runs for setting in run.elsewhere if setting.scene == scene]
+
+
+def _successes(runs: CellRuns, closure: Closure | None = None) -> Array:
+    """S of every training seed, by the method's own rule unless another is asked for."""
+    rule = closure or runs.closure or "all"
+    return 100 * np.array([metrics.summarise_run(rounds, rule).success for rounds in runs.finished.values()])
+
+
+def _lengths(runs: CellRuns) -> Array:
+    """MEL of every training seed; nan where nothing was won."""
+    found = (metrics.summarise_run(rounds, runs.closure or "all") for rounds in runs.finished.values())
+    return np.array([run.mean_episode_length or math.nan for run in found])
+
+
+def _curves(cell: Cell, runs: CellRuns) -> Array:
+    """Learning curves, a row each."""
+    return 100 * np.stack([read_curve(RESULTS / "runs" / run_path(cell, seed)).success for seed in runs.finished])
+
+
+def _first_at_80(curve: Array) -> float:
+    """When a curve with a point every 50,000 world-steps is first at 80 % or above, in millions; inf if never."""
+    there = np.flatnonzero(curve >= 80)
+    return 0.05 * float(there[0] + 1) if len(there) else math.inf
+
+
+def _is_shown(one: CellRuns, other: CellRuns, order: Sequence[int]) -> bool:
+    """Whether a difference in S is shown if the first cell's seeds meet the second's in this order."""
+    paired = dict(zip(one.finished, (other.finished[seed] for seed in order), strict=True))
+    found = metrics.success_difference(one.finished, paired, one.closure or "all", other.closure or "all")
+    return found is not None and found.shown
+
+
+def _paired(first: Array, second: Array) -> str:
+    """Mean and interval of the difference over the training seeds."""
+    difference = first - second
+    low, high = metrics.student_interval(difference.tolist()) or (math.nan, math.nan)
+    return f"{difference.mean():.1f} [{low:.1f}, {high:.1f}]"
+
+
+def _welch(first: Array, second: Array) -> str:
+    """Welch's interval of the difference: no seed is paired with another."""
+    low, high = stats.ttest_ind(first, second, equal_var=False).confidence_interval(0.95)
+    return f"[{low:.2f}, {high:.2f}]"
+
+
+def _named(cell: Cell) -> str:
+    return f"{label(cell.method)}, {cell.setting.symbols}"
+
+
+def _listed(values: Array) -> str:
+    return ", ".join(f"{value:.1f}" for value in values)
+
+
+if __name__ == "__main__":
+    main()
