@@ -126,7 +126,9 @@ def verify_results(
     if as_json:
         typer.echo(json.dumps({"passed": found.passed, **found._asdict()}))
     else:
-        check = "every figure of every round" if found.exact else "how the rounds end: another processor than the runs'"
+        check = "every figure of every round" + (
+            "" if found.exact else "; another processor's runs: how the rounds end"
+        )
         typer.echo(f"check: {check}")
         for name in found.changed:
             typer.echo(f"changed: {out / name}")

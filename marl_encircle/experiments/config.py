@@ -102,7 +102,7 @@ class Config(Section):
 
     @property
     def settings(self) -> list[Setting]:
-        """The settings that are trained in, as many worlds in each."""
+        """The settings that are trained in, each with the same share of the worlds; what stands twice has two."""
         return [setting.build() for setting in self.training.settings] or [self.cell.setting]
 
 

@@ -152,7 +152,7 @@ Curriculum = Annotated[
 class TrainingConfig(GrownSection):
     """How long, in how many worlds, by which curriculum.
 
-    :param settings: as many worlds are trained in each; none: all in the scenario's own
+    :param settings: each has the same share of the worlds, what stands twice has two; none: the scenario's own has all
     """
 
     n_worlds: Annotated[int, Field(ge=1, le=1 << 16)]

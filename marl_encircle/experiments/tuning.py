@@ -274,12 +274,12 @@ class _Search:
                     self._end(attempt, TrialState.FAIL)
                     return
                 attempt.waiting.append(job)  # its process was killed
-        if self._is_worse(attempt):
+        if self._report_points(attempt):
             self._end(attempt, TrialState.PRUNED)
         elif not attempt.waiting and not attempt.workers:
             self._end(attempt, TrialState.COMPLETE, mean(self._worth(attempt, job) for job in attempt.started))
 
-    def _is_worse(self, attempt: _Attempt) -> bool:
+    def _report_points(self, attempt: _Attempt) -> bool:
         """Tell Optuna the new points, those that all seeds started so far have; return whether to give the trial up."""
         curves = [attempt.curve(job) for job in attempt.started]
         for point in range(attempt.reported + 1, min(map(len, curves), default=0) + 1):

@@ -149,7 +149,7 @@ def pairs_of(runs: Mapping[Cell, CellRuns], paper: Mapping[Cell, PaperResult]) -
 
 
 def numbers_table(gaps: Iterable[Gap], calibrated: Collection[Cell]) -> Table:
-    """Mean differences to the paper's numbers, over the held-out cells, by Eq. 6 and by method."""
+    """Return the mean differences to the paper: of the calibrated cells, and of the others, by Eq. 6, by method."""
     gaps = list(gaps)
     held_out = [gap for gap in gaps if gap.cell not in calibrated]
     groups = {
@@ -207,7 +207,7 @@ def _papers_difference(first: PaperResult | None, second: PaperResult | None) ->
 
 
 def _means(values: list[float]) -> tuple[str, str]:
-    """Mean of the amounts, and mean."""
+    """Write the mean of the amounts, and the mean."""
     if not values:
         return DASH, DASH
     return f"{np.abs(values).mean():.2f}", f"{np.mean(values):+.2f}"

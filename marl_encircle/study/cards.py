@@ -24,11 +24,11 @@ from marl_encircle.study.paper import label
 CARD = "README.md"
 """Name of a card in its run's folder, where a browser of the repository shows it."""
 
-_RULES = {"all": "pursuers and obstacles enclose the target together", "pursuers": "the pursuers enclose it alone"}
+_CLOSURES = {"all": "pursuers and obstacles enclose the target together", "pursuers": "the pursuers enclose it alone"}
 
 _LIMITS = """\
-- This is one training seed, the first and not the best: another gives another policy. The interval of S holds the noise
-  of the evaluation rounds only; the tables have the intervals over the training seeds.
+- This is one training seed, the first, chosen by nothing else: another gives another policy. The interval of S holds
+  the noise of the evaluation rounds only; the tables have the intervals over the training seeds.
 - {limit}
 - The target follows one fixed rule. Nothing is known about targets that learn, nor about anything but a simulation.
 
@@ -108,7 +108,7 @@ def _facts(record: Mapping[str, Any], config: Config, summary: RunSummary) -> st
     low, high = summary.success_interval
     length = summary.mean_episode_length
     rows = {
-        "method": f"`{config.reward.name}`; a round is won once {_RULES[config.reward.closure]}",
+        "method": f"`{config.reward.name}`; a round is won once {_CLOSURES[config.reward.closure]}",
         "setting": f"{in_words(config.cell.setting).removeprefix('with ')}; scene: {config.scenario.scene}",
         **_trained_in(config),
         "scenario": ", ".join(f"`{rule}`" for rule in _rules(config.scenario)) or "the default rules",

@@ -23,9 +23,10 @@ _NOTES = [
 
 
 class _Row(NamedTuple):
-    """Ours minus another method in one setting, or why there is nothing to compare.
+    """Ours minus another method in one setting.
 
     :param own_rules: whether each method is under its own closure rule; only then there is a sigma_c
+    :param reason: why there is nothing to compare
     """
 
     cell: Cell
@@ -35,7 +36,7 @@ class _Row(NamedTuple):
     success: Difference | None
     length: Difference | None
     sigma: Difference | None
-    nothing: str | None
+    reason: str | None
 
 
 def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> dict[str, str]:
@@ -56,7 +57,7 @@ def render_differences(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], not
 def difference_table(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns], notes: Sequence[str]) -> Table:
     """Return as a table the rows of :func:`render_differences` in which both methods have runs; others are counted."""
     rows = _all_rows(cells, runs)
-    there = [row for row in rows if row.nothing != NOT_RUN]
+    there = [row for row in rows if row.reason != NOT_RUN]
     missing = len(rows) - len(there)
     left_out = [f"Rows left out in which one of the two is not run: {missing}."] if missing else []
     return _table(there, [*notes, *left_out])
@@ -96,9 +97,9 @@ def _all_rows(cells: Iterable[Cell], runs: Mapping[Cell, CellRuns]) -> list[_Row
 
 def _rows(cell: Cell, runs: Mapping[Cell, CellRuns]) -> Iterator[_Row]:
     ours, other = runs.get(Cell("ours", cell.setting)), runs.get(cell)
-    nothing = nothing_to_compare(ours, other)
-    if nothing is not None or ours is None or other is None or ours.closure is None or other.closure is None:
-        yield _Row(cell, True, None, None, None, None, None, nothing)
+    reason = why_incomparable(ours, other)
+    if reason is not None or ours is None or other is None or ours.closure is None or other.closure is None:
+        yield _Row(cell, True, None, None, None, None, None, reason)
         return
     sigma = metrics.sigma_difference(ours.finished, other.finished)
     rules: list[tuple[Closure, Closure]] = [(ours.closure, other.closure)]
@@ -115,13 +116,13 @@ def paired_success(first: Result, second: Result) -> Difference | None:
     """Return S of the first minus S of the second, each under its result's rule; None where nothing is common."""
     if first.runs is None or second.runs is None or first.closure is None or second.closure is None:
         return None
-    if nothing_to_compare(first.runs, second.runs) is not None:
+    if why_incomparable(first.runs, second.runs) is not None:
         return None
     return metrics.success_difference(first.runs.finished, second.runs.finished, first.closure, second.closure)
 
 
-def nothing_to_compare(first: CellRuns | None, second: CellRuns | None) -> str | None:
-    """Why two cells cannot be compared; None if they can."""
+def why_incomparable(first: CellRuns | None, second: CellRuns | None) -> str | None:
+    """Return why two cells cannot be compared, None if they can."""
     if first is None or second is None:
         return NOT_RUN
     if not first.finished or not second.finished:
@@ -140,7 +141,7 @@ def _shown(row: _Row) -> list[str]:
     """Write a row in Markdown."""
     cells = [label(row.cell.method), *row.cell.setting.numbers]
     if row.success is None:
-        return [*cells, "", row.nothing or "", "", "", ""]
+        return [*cells, "", row.reason or "", "", "", ""]
     return [
         *cells,
         f"{row.closure_ours} / {row.closure_other}",
@@ -177,7 +178,7 @@ def _record(row: _Row) -> dict[str, str]:
         **setting_columns(row.cell.setting),
         "closure_ours": row.closure_ours or "",
         "closure_other": row.closure_other or "",
-        "result": row.nothing or "compared",
+        "result": row.reason or "compared",
         **estimate_columns("success_percent_difference", row.success, 100),
         "success_verdict": row.success.verdict if row.success else "",
         **estimate_columns("length_difference", row.length, 1),

@@ -1,6 +1,6 @@
 """The whole road for a grid: train what is missing, evaluate what is missing, render the tables."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid
 from marl_encircle.experiments.grid_runs import runs_of
 from marl_encircle.experiments.loading import load_run
-from marl_encircle.experiments.records import RECORD, episodes_name, read_record, read_runs
+from marl_encircle.experiments.records import RECORD, Setting, episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
 from marl_encircle.experiments.train import run_folder, write_episodes
 from marl_encircle.study.agreement import AGREEMENT_TABLES, render_agreement
@@ -49,8 +49,8 @@ def reproduce(
 ) -> Reproduction:
     """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
 
-    A run whose rounds had to be played again counts as evaluated, not as reused. Where every run failed no table is
-    written. Arguments are those of ``sweep``.
+    A run whose own rounds had to be played again counts as evaluated, not as reused. Where every run failed no table
+    is written. Arguments are those of ``sweep``.
 
     :raises DamagedFileError: if a run there is not what its record says
     """
@@ -59,30 +59,31 @@ def reproduce(
     evaluated = 0
     for job in grid.jobs:
         folder = run_folder(job.config, job.seed, runs)
-        if not (folder / RECORD).exists():
-            continue
-        record = read_record(folder)
-        if record["status"] != "finished":
-            continue
-        hashes = record["sha256"]
-        settings = (None, *grid.elsewhere.get(job.config.cell, ()))
-        # Whatever is stopped between the rounds and their record leaves rounds without a hash.
-        missing = [
-            setting
-            for setting in settings
-            if (name := episodes_name(setting)) not in hashes or not files.is_kept(folder / name)
-        ]
+        missing = _missing_rounds(folder, grid.elsewhere.get(job.config.cell, ()))
         if missing:
             policy, config, _ = load_run(folder)
-            e = config.evaluation
+            rounds, seed = config.evaluation.episodes, config.evaluation.seed
             for setting in missing:
-                write_episodes(folder, play_rounds(policy, config, e.episodes, e.seed, setting), setting)
+                write_episodes(folder, play_rounds(policy, config, rounds, seed, setting), setting)
             evaluated += missing[0] is None
     trained = progress.done + progress.diverged - progress.reused
     done = Reproduction(trained, evaluated, progress.reused - evaluated, progress)
     if done.has_tables:
         write_tables(grid, results)
     return done
+
+
+def _missing_rounds(folder: Path, elsewhere: Iterable[Setting]) -> list[Setting | None]:
+    """Return where a finished run has not been evaluated: elsewhere, or, None, in its own setting."""
+    if not (folder / RECORD).exists():
+        return []
+    record = read_record(folder)
+    if record["status"] != "finished":
+        return []
+    names = {setting: episodes_name(setting) for setting in (None, *elsewhere)}
+    # Whatever is stopped between the rounds and their record leaves rounds without a hash.
+    kept = {name for name in names.values() if name in record["sha256"] and files.is_kept(folder / name)}
+    return [setting for setting, name in names.items() if name not in kept]
 
 
 def write_tables(grid: Grid, results: str | Path) -> list[Path]:

@@ -11,7 +11,7 @@ from marl_encircle.study.typeset import Table, Text, markdown, to_csv
 
 SCENE_TABLES = ("table_scenes.md", "table_scenes.csv")
 
-_TITLE = "Scenes that no policy was trained in"
+_TITLE = "The same policies in scenes that they were not trained in"
 _NOTES: list[Text] = [
     "Cells: S [95 % interval] / MEL of the same policies in each scene; they were trained in the first one.",
     "A policy sees where an obstacle's centre is, not its shape.",

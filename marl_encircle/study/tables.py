@@ -82,9 +82,8 @@ def render_tables(
         rendered[f"{name}.csv"] = to_csv([record_of(result, paper.get(result.cell)) for result in results])
     rendered |= _common_table(shown.cells, shown.runs, shown.paper, notes)
     if shown.other:
-        other = _other_table(shown.other, notes)
-        rendered["table_other.md"] = markdown(other)
-        rendered["table_other.csv"] = to_csv([record_of(result, None) for result in shown.other])
+        records = [record_of(result, None) for result in shown.other]
+        rendered |= zip(OTHER_TABLES, (markdown(_other_table(shown.other, notes)), to_csv(records)), strict=True)
     return rendered | render_differences(shown.cells, shown.runs, notes)
 
 

@@ -304,11 +304,11 @@ def test_the_round_drawn_is_the_median_of_those_that_needed_an_obstacle() -> Non
 
 
 def test_methods_and_pursuers_are_told_apart() -> None:
-    methods = (*curves.PAPERS_METHODS, "ours_plus", "generalist", "idea")
+    methods = (*curves.BY_IMPORTANCE, "ours_plus", "generalist", "idea")
     looks = [curves.series_of(method, methods) for method in methods]
     assert len({look.dashes for look in looks}) == len({look.marker for look in looks}) == len(SERIES)
     many = [*methods, *(f"idea_{i}" for i in range(9))]
-    papers = [curves.series_of(method, many) for method in curves.PAPERS_METHODS]
+    papers = [curves.series_of(method, many) for method in curves.BY_IMPORTANCE]
     assert papers == looks[:5]
     assert not {curves.series_of(method, many) for method in many[5:]} & set(papers)
 

@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 FIGURE4_METHODS = ("ours", "model_b", "ma2019")
 """What the paper compares."""
 
-PAPERS_METHODS = ("ours", "model_b", "ma2019", "model_a", "model_c")
-"""In the order of ``SERIES``; what is left of these is for all others in turn."""
+BY_IMPORTANCE = ("ours", "model_b", "ma2019", "model_a", "model_c")
+"""The paper's methods, each with its place in ``SERIES``; the places left are for all others in turn."""
 
 SETTINGS = (Setting(1.1, 3, 0), Setting(1.1, 3, 1))
 
@@ -72,15 +72,15 @@ def series_of(method: str, methods: Sequence[str] = ()) -> Series:
 
     :param methods: all methods of the figure, which give those that the paper lacks their places
     """
-    if method in PAPERS_METHODS:
-        return SERIES[PAPERS_METHODS.index(method)]
-    left = SERIES[len(PAPERS_METHODS) :]
-    return left[in_order({method, *methods} - set(PAPERS_METHODS)).index(method) % len(left)]
+    if method in BY_IMPORTANCE:
+        return SERIES[BY_IMPORTANCE.index(method)]
+    left = SERIES[len(BY_IMPORTANCE) :]
+    return left[in_order({method, *methods} - set(BY_IMPORTANCE)).index(method) % len(left)]
 
 
 def in_order(methods: Iterable[str]) -> list[str]:
     """Sort methods by their importance: the paper's, then what goes beyond, then others by name."""
-    papers = {method: place for place, method in enumerate(PAPERS_METHODS)}
+    papers = {method: place for place, method in enumerate(BY_IMPORTANCE)}
     return sorted(methods, key=lambda method: (papers.get(method, len(papers)), rank(method)))
 
 
