@@ -106,11 +106,10 @@ class LearningCurve(BaseCallback):
 
     def add_point(self) -> None:
         """Evaluate the present policy and write the curve so far."""
-        e = self.config.evaluation
-        settings = self.config.settings
-        n_rounds = -(-e.curve_episodes // len(settings))
+        evaluation, settings = self.config.evaluation, self.config.settings
+        n_rounds, seed = -(-evaluation.curve_episodes // len(settings)), evaluation.curve_seed
         policy = self.model.policy
-        played = {each: play_rounds(policy, self.config, n_rounds, e.curve_seed, each) for each in set(settings)}
+        played = {each: play_rounds(policy, self.config, n_rounds, seed, each) for each in set(settings)}
         every = chain.from_iterable(played[each] for each in settings)  # those with more worlds count for more
         episodes = [episode._replace(round=i) for i, episode in enumerate(every)]
         own = summarise_run(episodes, self.config.reward.closure)

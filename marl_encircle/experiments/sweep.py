@@ -162,19 +162,18 @@ def _train(
             for worker in [worker for worker in running if worker.poll() is not None]:
                 job = running.pop(worker)
                 record = _record_of(job, out)
-                if record is None:
-                    if _was_killed(worker) and retries[job] < MAX_RETRIES:
-                        retries[job] += 1
-                        logger.warning(
-                            "%s: its process was killed; retry %d of %d", name_of(job), retries[job], MAX_RETRIES
-                        )
-                        waiting.append(job)
-                    else:
-                        progress.failed.append(name_of(job))
-                    continue
-                _count(record, progress)
-                if record["status"] == "finished":
-                    progress.cpu_seconds.append(record["cpu_seconds"])
+                if record is not None:
+                    _count(record, progress)
+                    if record["status"] == "finished":
+                        progress.cpu_seconds.append(record["cpu_seconds"])
+                elif _was_killed(worker) and retries[job] < MAX_RETRIES:
+                    retries[job] += 1
+                    logger.warning(
+                        "%s: its process was killed; retry %d of %d", name_of(job), retries[job], MAX_RETRIES
+                    )
+                    waiting.append(job)
+                else:
+                    progress.failed.append(name_of(job))
     progress.running = []
 
 
