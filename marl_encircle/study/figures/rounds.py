@@ -127,7 +127,7 @@ def _in_words(column: Column) -> str:
     choice, replay = column.choice, column.replay
     if choice is None or replay is None:
         return column.note
-    rounds = f"{choice.with_obstacle} of {choice.solved} solved rounds\nclosed first with the obstacle"
+    rounds = f"{choice.with_obstacle} of {choice.solved} solved rounds\nclosed with the obstacle"
     if replay.scenario.obstacles == 0:
         rounds = f"{choice.solved} of {choice.played} rounds solved"
     return f"{rounds}\n{column.note}".rstrip()
