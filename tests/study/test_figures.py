@@ -293,13 +293,13 @@ def test_figure_6_draws_the_round_until_its_success() -> None:
     assert any("3 of 7 solved rounds" in text for text in written)
 
 
-def test_the_round_drawn_is_the_median_of_those_that_needed_an_obstacle() -> None:
+def test_the_round_drawn_is_the_median_of_those_that_an_obstacle_helped_to_solve() -> None:
     unsolved, alone = episode(0, None, 7), [episode(n, n, n) for n in (1, 2)]
-    needed = [episode(3, 40, None), episode(4, 10, 11), episode(5, 20, None), episode(6, 20, 30)]
+    helped = [episode(3, 40, None), episode(4, 10, 11), episode(5, 20, None), episode(6, 20, 30)]
     # Of 10, 20, 20, 40 the second: round 5 comes before round 6.
-    assert choose_round([unsolved, *alone, *needed], "all") == Choice(5, 4, 6, 7)
+    assert choose_round([unsolved, *alone, *helped], "all") == Choice(5, 4, 6, 7)
     assert choose_round([unsolved, *alone], "all") == Choice(1, 0, 2, 3)
-    assert choose_round([unsolved, *needed], "pursuers") == Choice(4, 0, 3, 5)
+    assert choose_round([unsolved, *helped], "pursuers") == Choice(4, 0, 3, 5)
     assert choose_round([unsolved], "all") is None
 
 
