@@ -588,7 +588,15 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
     expected = {"trained": 2, "evaluated": 0, "reused": 0, "failed": 0, "diverged": 0}
     assert (done.code, json.loads(done.out)) == (0, expected)
     found = json.loads(run("verify-results", *results, "--quiet", "--json").out)
-    expected = {"passed": True, "rounds": 16, "equal": 16, "cells_off": 0, "exact": True, "changed": []}
+    expected = {
+        "passed": True,
+        "rounds": 16,
+        "equal": 16,
+        "unequal_here": 0,
+        "cells_off": 0,
+        "exact": True,
+        "changed": [],
+    }
     assert found == expected
     (tmp_path / "results" / "tables" / "table2.md").write_text("edited")
     done = run("verify-results", *results, "--quiet", "--json")

@@ -341,7 +341,7 @@ def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("al", "did you mean all?"),
+        ("stud", "did you mean study?"),
         ("nope", "known: smoke, study"),
         ("calibration", "known: smoke, study"),
         ("absent.yaml", "No such file"),
