@@ -5,6 +5,7 @@ lengths in steps; brackets hold 95 % intervals, Student's t over the training se
 """
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 from pathlib import Path
@@ -46,7 +47,7 @@ class Results(NamedTuple):
 def main() -> None:
     """Print every section."""
     for title, lines in findings(read_results()).items():
-        print(title, "", *(f"  {line}" for line in lines), "", sep="\n")
+        sys.stdout.write("\n".join([title, "", *(f"  {line}" for line in lines), "\n"]))
 
 
 def read_results() -> Results:
@@ -58,18 +59,16 @@ def read_results() -> Results:
 
 def findings(results: Results) -> dict[str, Iterator[str]]:
     """Return the title of each section, and its lines, which are found when they are asked for."""
-    return {str(section.__doc__): section(results) for section in _SECTIONS}
+    return {title: section(results) for title, section in _SECTIONS.items()}
 
 
 def _seeds(results: Results) -> Iterator[str]:
-    """S and MEL of every training seed"""
     for cell, runs in _own(results):
         successes, lengths = _successes(runs), _lengths(runs)
         yield f"{_named(cell)}: {successes.mean():.2f} of {_listed(successes)}; {_listed(lengths)}"
 
 
 def _losses(results: Results) -> Iterator[str]:
-    """From none to three obstacles, paired by training seed: loss in S; MEL with none and with three"""
     for method in TABLE_METHODS:
         none, three = (results.cells[Cell(method, Setting(1.1, 3, m))] for m in (0, 3))
         lengths = np.array([np.nanmean(_lengths(runs)) for runs in (none, three)])
@@ -77,7 +76,6 @@ def _losses(results: Results) -> Iterator[str]:
 
 
 def _counting(results: Results) -> Iterator[str]:
-    """What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1"""
     for method in ("ma2019", "model_a"):
         for m in (1, 2, 3):
             runs = results.cells[Cell(method, Setting(1.1, 3, m))]
@@ -85,7 +83,6 @@ def _counting(results: Results) -> Iterator[str]:
 
 
 def _help(results: Results) -> Iterator[str]:
-    """Wins of Ours in which the circle closed first with the obstacle, and never without, one obstacle at ratio 1.1"""
     for n in (2, 3, 4, 5):
         seeds = results.cells[Cell("ours", Setting(1.1, n, 1))].finished.values()
         won = [episode for rounds in seeds for episode in rounds if episode.step_all is not None]
@@ -95,14 +92,12 @@ def _help(results: Results) -> Iterator[str]:
 
 
 def _slowness(results: Results) -> Iterator[str]:
-    """Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval"""
     for setting in sorted({cell.setting for cell in results.cells if not pursuers_suffice(cell.setting)}):
         ours, other = (_lengths(results.cells[Cell(method, setting)]) for method in ("ours", "model_b"))
         yield f"{setting.symbols}: {_paired(ours, other)}; {_welch(ours, other)}"
 
 
 def _rises(results: Results) -> Iterator[str]:
-    """Rise of the learning curves over the last two fifths, over the last two tenths"""
     for cell, runs in _own(results):
         mean = _curves(cell, runs).mean(axis=0)
         parts = (len(mean) // 5, len(mean) // 10)
@@ -111,7 +106,6 @@ def _rises(results: Results) -> Iterator[str]:
 
 
 def _speed(results: Results) -> Iterator[str]:
-    """Million world-steps until the mean curve has 80 %; the same without the latest seed"""
     for m in (0, 1):
         for method in ("model_b", "ma2019", "ours"):
             cell = Cell(method, Setting(1.1, 3, m))
@@ -122,7 +116,6 @@ def _speed(results: Results) -> Iterator[str]:
 
 
 def _scenes(results: Results) -> Iterator[str]:
-    """Other shapes of obstacles: S of Model B, Ours and Ours+; Ours+ minus Ours; Ours with half the budget and since"""
     for scene in ("concave", "tunnel"):
         then, now = (gather(_played_in(scene, runs), {}) for runs in (results.former, results.runs))
         for cell in (cell for cell in now if cell.method == "ours"):
@@ -134,7 +127,6 @@ def _scenes(results: Results) -> Iterator[str]:
 
 
 def _nearness(results: Results) -> Iterator[str]:
-    """S minus the paper's, held-out cells unless said: mean of the amounts, mean"""
     gaps = gaps_of(results.cells, reported_cells())
     chose = [gap for gap in gaps if gap.cell in CHOSE_THE_SCENARIO]
     held_out = [gap for gap in gaps if gap not in chose and not results.cells[gap.cell].runs_of]
@@ -152,7 +144,6 @@ def _nearness(results: Results) -> Iterator[str]:
 
 
 def _distances(results: Results) -> Iterator[str]:
-    """Where Eq. 6 holds: how far a difference of two methods is from the paper's; can the noise of both be why"""
     paper = reported_cells()
     for pair in pairs_of(results.cells, paper):
         if pair.ours.interval is None or not pursuers_suffice(pair.first.setting):
@@ -166,7 +157,6 @@ def _distances(results: Results) -> Iterator[str]:
 
 
 def _pairings(results: Results) -> Iterator[str]:
-    """Differences in S that some of the 120 pairings of seeds show: do the tables, how many do; Welch's interval"""
     for setting in sorted({cell.setting for cell in results.cells}):
         cells = [Cell(method, setting) for method in reversed(STUDY)]
         whole = [cell for cell, runs in _own(results) if cell in cells and len(runs.finished) == 5]
@@ -180,7 +170,6 @@ def _pairings(results: Results) -> Iterator[str]:
 
 
 def _hours(_: Results) -> Iterator[str]:
-    """Processor time"""
     groups = {"the study": STUDY, "Ours+": ("ours_plus",), "the one policy": ("generalist",)}
     for folder in ("runs", "former"):
         records = [read_record(path.parent) for path in sorted((RESULTS / folder).glob("*/*/*/run.json"))]
@@ -189,29 +178,29 @@ def _hours(_: Results) -> Iterator[str]:
             yield f"{folder}, {name}: {sum(hours):.2f} hours, {len(hours)} runs"
 
 
-_SECTIONS: tuple[Callable[[Results], Iterator[str]], ...] = (
-    _seeds,
-    _losses,
-    _counting,
-    _help,
-    _slowness,
-    _rises,
-    _speed,
-    _scenes,
-    _nearness,
-    _distances,
-    _pairings,
-    _hours,
-)
+_SECTIONS: dict[str, Callable[[Results], Iterator[str]]] = {
+    "S and MEL of every training seed": _seeds,
+    "From none to three obstacles, paired by training seed: loss in S; MEL with none and with three": _losses,
+    "What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1": _counting,
+    "Wins of Ours at ratio 1.1, m=1, in which the circle closed first with the obstacle; never without": _help,
+    "Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval": _slowness,
+    "Rise of the learning curves over the last two fifths, over the last two tenths": _rises,
+    "Million world-steps until the mean curve has 80 %; the same without the latest seed": _speed,
+    "Other shapes of obstacles: S of Model B, Ours, Ours+; Ours+ minus Ours; Ours with half the budget, since": _scenes,
+    "S minus the paper's, held-out cells unless said: mean of the amounts, mean": _nearness,
+    "Where Eq. 6 holds: how far a difference is from the paper's; can the noise of both be why": _distances,
+    "Differences in S that some of the 120 pairings of seeds show: do the tables, how many do; Welch": _pairings,
+    "Processor time": _hours,
+}
 
 
 def _own(results: Results) -> Iterator[tuple[Cell, CellRuns]]:
-    """The cells that show no other cell's runs."""
+    """Return the cells that show no other cell's runs."""
     return ((cell, runs) for cell, runs in results.cells.items() if not runs.runs_of)
 
 
 def _played_in(scene: str, runs: Sequence[Run]) -> list[Run]:
-    """What policies played in another scene, as runs of that."""
+    """Return what policies played in another scene, as runs of that."""
     return [run_elsewhere(run, setting) for run in runs for setting in run.elsewhere if setting.scene == scene]
 
 

@@ -126,10 +126,8 @@ def verify_results(
     if as_json:
         typer.echo(json.dumps({"passed": found.passed, **found._asdict()}))
     else:
-        check = "every figure of every round" + (
-            "" if found.exact else "; another processor's runs: how the rounds end"
-        )
-        typer.echo(f"check: {check}")
+        partly = "how the rounds end, and every figure where this processor made the run"
+        typer.echo(f"check: {'every figure of every round' if found.exact else partly}")
         for name in found.changed:
             typer.echo(f"changed: {out / name}")
         typer.echo(f"rounds={found.rounds} equal={found.equal} cells_off={found.cells_off}")

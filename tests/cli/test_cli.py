@@ -598,7 +598,9 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
         "changed": [],
     }
     assert found == expected
-    (tmp_path / "results" / "tables" / "table2.md").write_text("edited")
+    table = tmp_path / "results" / "tables" / "table2.md"
+    before = table.read_text()
+    table.write_text("edited")
     done = run("verify-results", *results, "--quiet", "--json")
     assert (done.code, json.loads(done.out)) == (3, {**expected, "passed": False, "changed": ["tables/table2.md"]})
     done = run("verify-results", *results, "--quiet")
@@ -606,7 +608,18 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
         3,
         [
             "check: every figure of every round",
-            f"changed: {tmp_path / 'results' / 'tables' / 'table2.md'}",
+            f"changed: {table}",
+            "rounds=16 equal=16 cells_off=0",
+        ],
+    )
+    table.write_text(before)
+    record = next((tmp_path / "results" / "runs" / "ours").rglob("run.json"))
+    files.write_json(record, {**json.loads(record.read_text()), "cpu": "another"})
+    done = run("verify-results", *results, "--quiet")
+    assert (done.code, done.out.splitlines()) == (
+        0,
+        [
+            "check: how the rounds end, and every figure where this processor made the run",
             "rounds=16 equal=16 cells_off=0",
         ],
     )

@@ -11,7 +11,7 @@ from marl_encircle import files
 from marl_encircle.experiments.episodes import episodes_from_csv, episodes_to_csv
 from marl_encircle.experiments.grid import Grid, Job
 from marl_encircle.experiments.records import Setting
-from marl_encircle.experiments.train import run_folder
+from marl_encircle.experiments.train import run_folder, train
 from marl_encircle.study import verify as verification
 from marl_encircle.study.figures.write import write_figures
 from marl_encircle.study.reproduce import write_tables
@@ -79,6 +79,19 @@ def test_another_processor_may_round_otherwise_but_not_end_otherwise(
     found = verify(GRID, results)
     assert found.equal == 7
     assert not found.passed  # one of eight is more than 0.5 %
+
+
+def test_a_run_of_another_processor_excuses_no_round_of_this_one(results: Path) -> None:
+    job = Job("ours", Setting(1.1, 3, 1), 1, "smoke", overrides=TINY)
+    grid = Grid((*GRID.jobs, job), {})
+    train(job.config, job.seed, "native", results / "runs")
+    record = run_folder(job.config, job.seed, results / "runs") / "run.json"
+    files.write_json(record, {**json.loads(record.read_text()), "cpu": "another"})
+    write_tables(grid, results)
+    assert verify(grid, results) == Verification(16, 16, 0, 0, exact=False, changed=())
+    change_a_round(results, return_mean=0.125)
+    write_tables(grid, results)
+    assert verify(grid, results) == Verification(16, 15, 1, 0, exact=False, changed=())
 
 
 def test_a_table_that_the_runs_do_not_give_is_found(results: Path) -> None:
