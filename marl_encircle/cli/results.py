@@ -124,7 +124,7 @@ def verify_results(
         typer.echo(f"nothing was verified: {out / 'runs'} has no finished run of the grid {grid}", err=True)
         raise typer.Exit(3)
     if as_json:
-        typer.echo(json.dumps({"passed": found.passed, **found._asdict()}))
+        typer.echo(json.dumps({"passed": found.passed, "exact": found.exact, **found._asdict()}))
     else:
         partly = "how the rounds end, and every figure where this processor made the run"
         typer.echo(f"check: {'every figure of every round' if found.exact else partly}")

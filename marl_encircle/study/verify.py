@@ -5,7 +5,7 @@ round may then take another course: there 99.5 % of the rounds must end alike, e
 binomial interval of the S that is recorded, and pictures are not compared.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -30,23 +30,29 @@ class Verification(NamedTuple):
 
     :param rounds: rounds played again
     :param equal: those that ended as recorded; on the run's own processor also with the same figures
-    :param unequal_here: those of runs made on this processor that are not equal
+    :param rounds_here: rounds of runs that were made on this processor
+    :param equal_here: those of them that are equal
     :param cells_off: cells whose S lies outside the interval
-    :param exact: whether all runs were made on this processor, so that every round must be equal
     :param changed: tables, cards and figures that are not what the runs give
     """
 
     rounds: int
     equal: int
-    unequal_here: int
+    rounds_here: int
+    equal_here: int
     cells_off: int
-    exact: bool
     changed: tuple[str, ...]
+
+    @property
+    def exact(self) -> bool:
+        """Whether all runs were made on this processor, so that every round must be equal."""
+        return self.rounds_here == self.rounds
 
     @property
     def passed(self) -> bool:
         """Whether there are results and they are those of this code."""
-        enough = not self.unequal_here and self.equal >= EQUAL_SHARE * self.rounds
+        elsewhere, equal_elsewhere = self.rounds - self.rounds_here, self.equal - self.equal_here
+        enough = self.equal_here == self.rounds_here and equal_elsewhere >= EQUAL_SHARE * elsewhere
         return self.rounds > 0 and enough and not self.cells_off and not self.changed
 
 
@@ -60,13 +66,11 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     texts = render(grid, results)  # and with that, whether every run is what its record says
     folders = [run_folder(job.config, job.seed, Path(results) / "runs") for job in grid.jobs]
     folders = [folder for folder in folders if (folder / RECORD).exists() and files.is_kept(folder / episodes_name())]
-    rounds = equal = unequal_here = 0
-    exact = True
+    rounds, equal = Counter[bool](), Counter[bool]()  # by whether the run was made on this processor
     successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)
     for done, folder in enumerate(folders, start=1):
         policy, config, record = load_run(folder)
-        same_processor = record.get("cpu") == cpu_model()
-        exact &= same_processor
+        here = record.get("cpu") == cpu_model()
         closure = config.reward.closure
         for setting in (None, *grid.elsewhere.get(config.cell, ())):
             name = episodes_name(setting)
@@ -74,10 +78,8 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
                 continue
             recorded = read_episodes(folder, record, setting)
             played = play_rounds(policy, config, len(recorded), config.evaluation.seed, setting)
-            same = count_equal(recorded, played, same_processor)
-            rounds += len(recorded)
-            equal += same
-            unequal_here += len(recorded) - same if same_processor else 0
+            rounds[here] += len(recorded)
+            equal[here] += count_equal(recorded, played, here)
             successes[config.cell, setting] += [
                 (then.success_step(closure) is not None, now.success_step(closure) is not None)
                 for then, now in zip(recorded, played, strict=True)
@@ -86,12 +88,12 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
             report(done, len(folders))
     off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())
     contents = {name: text.encode() for name, text in texts.items()}
-    if exact and (Path(results) / "figures").is_dir():
+    if not rounds[False] and (Path(results) / "figures").is_dir():
         from marl_encircle.study.figures.write import encode_figures
 
         contents |= encode_figures(grid, results)
     changed = [name for name, data in contents.items() if _read(Path(results) / name) != data]
-    return Verification(rounds, equal, unequal_here, off, exact, tuple(changed))
+    return Verification(rounds.total(), equal.total(), rounds[True], equal[True], off, tuple(changed))
 
 
 def count_equal(recorded: Sequence[Episode], played: Sequence[Episode], exact: bool) -> int:
