@@ -18,6 +18,7 @@ from marl_encircle import files, locks
 from marl_encircle.core.simulator import Difficulty, Simulator
 from marl_encircle.envs.curriculum import CurriculumVecEnv
 from marl_encircle.experiments import checkpoint, divergence
+from marl_encircle.experiments.allocator import keep_freed_memory
 from marl_encircle.experiments.build import build_model, build_vec_env, check_engine, policy_bytes
 from marl_encircle.experiments.callbacks import Checkpointer, LearningCurve, RoundLogger, ended_rounds
 from marl_encircle.experiments.choices import Engine
@@ -98,6 +99,7 @@ def train(
             return folder, False
         files.remove_temporary(folder)
         th.set_num_threads(1)
+        keep_freed_memory()
         _Run(config, seed, engine, folder, plan).play(checkpoint_every, progress_bar, tensorboard, draw)
     return folder, True
 

@@ -85,7 +85,7 @@ def is_plain(model: Actor | CentralCritic) -> bool:
         and all(type(network.activation) is nn.ReLU and len(network.weights) for network in networks)
         and len(networks) == (len(model.q_networks) if isinstance(model, CentralCritic) else 1)
         and not any(_has_hooks(module) for module in modules)
-        and all(_is_plain_parameter(parameter) for parameter in model.parameters())
+        and all(_is_plain_parameter(parameter) for module in modules for parameter in module._parameters.values())
         and not th.is_autocast_enabled(networks[0].head_weight.device.type)
     )
 
@@ -95,7 +95,9 @@ def _has_hooks(module: nn.Module) -> bool:
     return any(hooks)
 
 
-def _is_plain_parameter(parameter: nn.Parameter) -> bool:
+def _is_plain_parameter(parameter: nn.Parameter | None) -> bool:
+    if parameter is None:  # as a layer without bias has it
+        return True
     hooks = parameter._backward_hooks, parameter._post_accumulate_grad_hooks
     return parameter.requires_grad and not any(hooks)
 

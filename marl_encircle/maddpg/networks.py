@@ -12,6 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
+mask_where_zero = th.ops.aten.threshold_backward.grad_input
+"""ReLU's backward pass, in place; looked up once, as that takes as long as a small product."""
+
 
 class StackedMLP(nn.Module):
     """``n`` multilayer perceptrons of one shape, each with an activation after every layer but the last.
@@ -131,7 +134,7 @@ class StackedMLP(nn.Module):
             self.head_bias.grad = grad.sum(1, keepdim=True).sum_to_size(self.head_bias.shape)
         grad = grad_rows.mT @ rows
         for weight, bias in reversed(self.layers):
-            th.ops.aten.threshold_backward.grad_input(grad, above, 0, grad_input=grad)
+            mask_where_zero(grad, above, 0, grad_input=grad)
             above = activations.pop()
             if not constant:
                 weight.grad = (above.mT @ grad).sum_to_size(weight.shape)

@@ -225,6 +225,8 @@ class MADDPGPolicy(BasePolicy):
 
         :param mode: whether to train
         """
+        if self.training == self.actor.training == self.critic.training == mode:
+            return  # walking through all modules takes as long as acting in a few worlds
         self.actor.set_training_mode(mode)
         self.critic.set_training_mode(mode)
         self.training = mode

@@ -316,6 +316,17 @@ def test_policy_delay_spares_actors_and_targets() -> None:
     assert not th.equal(weights(model.critic_target), target)
 
 
+@pytest.mark.parametrize("mode", [True, False])
+def test_a_network_that_was_put_into_another_mode_alone_is_put_back(mode: bool) -> None:
+    policy = make_model().policy
+    networks = [policy.actor, policy.critic]
+    for network in networks:
+        policy.set_training_mode(mode)
+        network.train(not mode)
+        policy.set_training_mode(mode)
+        assert {module.training for each in networks for module in each.modules()} == {mode}
+
+
 def weights(module: th.nn.Module) -> th.Tensor:
     return th.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 
