@@ -111,6 +111,7 @@ class MADDPGPolicy(BasePolicy):
         )
         self._parameter_lists = list(targets.parameters()), list(networks.parameters())
         pairs = zip(targets.modules(), networks.modules(), strict=True)
+        self._switched = [*self.actor.modules(), *self.critic.modules()]
         self._buffer_owners = [(target, network) for target, network in pairs if target._buffers]
 
     @th.no_grad()
@@ -225,8 +226,8 @@ class MADDPGPolicy(BasePolicy):
 
         :param mode: whether to train
         """
-        if self.training == self.actor.training == self.critic.training == mode:
-            return  # walking through all modules takes as long as acting in a few worlds
+        if self.training == mode and all(module.training == mode for module in self._switched):
+            return
         self.actor.set_training_mode(mode)
         self.critic.set_training_mode(mode)
         self.training = mode

@@ -317,14 +317,14 @@ def test_policy_delay_spares_actors_and_targets() -> None:
 
 
 @pytest.mark.parametrize("mode", [True, False])
-def test_a_network_that_was_put_into_another_mode_alone_is_put_back(mode: bool) -> None:
+def test_a_module_that_was_put_into_another_mode_alone_is_put_back(mode: bool) -> None:
     policy = make_model().policy
-    networks = [policy.actor, policy.critic]
-    for network in networks:
+    modules = [*policy.actor.modules(), *policy.critic.modules()]
+    for module in modules:
         policy.set_training_mode(mode)
-        network.train(not mode)
+        module.train(not mode)
         policy.set_training_mode(mode)
-        assert {module.training for each in networks for module in each.modules()} == {mode}
+        assert {each.training for each in modules} == {mode}
 
 
 def weights(module: th.nn.Module) -> th.Tensor:
