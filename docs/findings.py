@@ -1,11 +1,14 @@
 """Print the numbers of reproduction.md and protocol.md that no table shows: python docs/findings.py.
 
-They come from what lies in results/: nothing is trained or played. Shares are in %, their differences in points,
-lengths in steps; brackets hold 95 % intervals, Student's t over the training seeds unless another is named.
+They come from what lies in results/: nothing is trained or played. Left out is what other commands of these pages
+print, and what was not kept. Shares are in %, their differences in points, lengths in steps; brackets hold 95 %
+intervals, Student's t over the training seeds unless another is named.
 """
 
+import csv
 import math
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 from pathlib import Path
@@ -23,12 +26,14 @@ from marl_encircle.experiments.records import Cell, Run, Setting, read_record, r
 from marl_encircle.study.agreement import PAPER_ROUNDS, gaps_of, pairs_of
 from marl_encircle.study.cells import CellRuns, gather, pursuers_suffice, run_elsewhere
 from marl_encircle.study.paper import TABLE_METHODS, label, reported_cells
+from marl_encircle.study.protocol import calibrated_cells
 
 Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parents[1] / "results"
 STUDY = (*TABLE_METHODS, "model_c")
-CHOSE_THE_SCENARIO = (Cell("ours", Setting(1.1, 3, 0)), Cell("ours", Setting(1.1, 2, 1)))
+CHOSEN = RESULTS / "calibration" / "runs" / "turn_order=simultaneous,acceleration=3"
+FORMER_ROUNDS = RESULTS / "former" / "rounds_of_seed_1000.csv"
 
 
 class Results(NamedTuple):
@@ -72,7 +77,7 @@ def _losses(results: Results) -> Iterator[str]:
     for method in TABLE_METHODS:
         none, three = (results.cells[Cell(method, Setting(1.1, 3, m))] for m in (0, 3))
         lengths = np.array([np.nanmean(_lengths(runs)) for runs in (none, three)])
-        yield f"{label(method)}: {_paired(_successes(none), _successes(three))}; {_listed(lengths)}"
+        yield f"{label(method)}: {_success_difference(none, three)}; {_listed(lengths)}"
 
 
 def _counting(results: Results) -> Iterator[str]:
@@ -98,11 +103,38 @@ def _slowness(results: Results) -> Iterator[str]:
 
 
 def _rises(results: Results) -> Iterator[str]:
+    amended = {run.cell for run in results.former}
     for cell, runs in _own(results):
-        mean = _curves(cell, runs).mean(axis=0)
-        parts = (len(mean) // 5, len(mean) // 10)
-        rise = [mean[-points:].mean() - mean[-2 * points : -points].mean() for points in parts]
-        yield f"{_named(cell)}: {rise[0]:+.1f}, {rise[1]:+.1f}"
+        if len(runs.finished) > 1:
+            mean = _curves(cell, runs).mean(axis=0)
+            before = f"; {_rise(mean[: len(mean) // 2], 5):.1f}" if cell in amended else ""
+            yield f"{_named(cell)}: {_rise(mean, 5):+.1f}, {_rise(mean, 10):+.1f}{before}"
+
+
+def _calibration(_: Results) -> Iterator[str]:
+    for cell in calibrated_cells():
+        curves = [
+            read_curve(path.parent).success for path in sorted((CHOSEN / run_path(cell, 0)).parent.glob("*/run.json"))
+        ]
+        yield f"{_named(cell)}: {', '.join(f'{_rise(100 * np.asarray(curve), 5):.1f}' for curve in curves)}"
+
+
+def _former_rounds(results: Results) -> Iterator[str]:
+    former = gather(results.former, {})
+    seeds: dict[Cell, dict[int, float]] = defaultdict(dict)
+    with FORMER_ROUNDS.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if (row["folder"], row["scene"]) == ("runs", "random"):
+                cell = Cell(row["method"], Setting(float(row["ratio"]), int(row["n"]), int(row["m"])))
+                seeds[cell][int(row["seed"])] = float(row["success_percent"])
+    changes = []
+    for cell, successes in seeds.items():
+        runs = former.get(cell, results.cells[cell])
+        now = dict(zip(runs.finished, _successes(runs), strict=True))
+        changes.append(np.mean([now[seed] - successes[seed] for seed in successes]))
+    amounts = np.abs(changes)
+    largest = _named(list(seeds)[amounts.argmax()])
+    yield f"{amounts.mean():.2f}, {np.mean(changes):+.2f} of {len(changes)}; {amounts.max():.1f}, {largest}"
 
 
 def _speed(results: Results) -> Iterator[str]:
@@ -119,16 +151,16 @@ def _scenes(results: Results) -> Iterator[str]:
     for scene in ("concave", "tunnel"):
         then, now = (gather(_played_in(scene, runs), {}) for runs in (results.former, results.runs))
         for cell in (cell for cell in now if cell.method == "ours"):
-            b, ours, plus = (_successes(now[cell._replace(method=name)]) for name in ("model_b", "ours", "ours_plus"))
-            means = ", ".join(f"{successes.mean():.1f}" for successes in (b, ours, plus))
-            half = _successes(then[cell]) if cell in then else None
-            since = f"; {half.mean():.1f}, {_paired(ours, half)}" if half is not None else ""
-            yield f"{scene}, {cell.setting.symbols}: {means}; {_paired(plus, ours)}{since}"
+            b, ours, plus = (now[cell._replace(method=name)] for name in ("model_b", "ours", "ours_plus"))
+            means = ", ".join(f"{_successes(runs).mean():.1f}" for runs in (b, ours, plus))
+            half = then.get(cell)
+            since = f"; {_successes(half).mean():.1f}, {_success_difference(ours, half)}" if half else ""
+            yield f"{scene}, {cell.setting.symbols}: {means}; {_success_difference(plus, ours)}{since}"
 
 
 def _nearness(results: Results) -> Iterator[str]:
     gaps = gaps_of(results.cells, reported_cells())
-    chose = [gap for gap in gaps if gap.cell in CHOSE_THE_SCENARIO]
+    chose = [gap for gap in gaps if gap.cell in calibrated_cells()]
     held_out = [gap for gap in gaps if gap not in chose and not results.cells[gap.cell].runs_of]
     alone = [gap for gap in held_out if pursuers_suffice(gap.cell.setting)]
     groups = {
@@ -184,7 +216,9 @@ _SECTIONS: dict[str, Callable[[Results], Iterator[str]]] = {
     "What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1": _counting,
     "Wins of Ours at ratio 1.1, m=1, in which the circle closed first with the obstacle; never without": _help,
     "Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval": _slowness,
-    "Rise of the learning curves over the last two fifths, over the last two tenths": _rises,
+    "Rise of the learning curves over the last two fifths, over the last two tenths; before the amendment": _rises,
+    "Rise of the calibration's curves in the chosen scenario over the last two fifths, each seed's": _calibration,
+    "S on the rounds of seed 4000 minus that on those of seed 1000: mean of the amounts, mean; largest": _former_rounds,
     "Million world-steps until the mean curve has 80 %; the same without the latest seed": _speed,
     "Other shapes of obstacles: S of Model B, Ours, Ours+; Ours+ minus Ours; Ours with half the budget, since": _scenes,
     "S minus the paper's, held-out cells unless said: mean of the amounts, mean": _nearness,
@@ -221,6 +255,12 @@ def _curves(cell: Cell, runs: CellRuns) -> Array:
     return 100 * np.stack([read_curve(RESULTS / "runs" / run_path(cell, seed)).success for seed in runs.finished])
 
 
+def _rise(curve: Array, parts: int) -> float:
+    """How much more a curve has over the last of so many parts than over the one before."""
+    points = len(curve) // parts
+    return float(curve[-points:].mean() - curve[-2 * points : -points].mean())
+
+
 def _first_at_80(curve: Array) -> float:
     """When a curve with a point every 50,000 world-steps is first at 80 % or above, in millions; inf if never."""
     there = np.flatnonzero(curve >= 80)
@@ -232,6 +272,16 @@ def _is_shown(one: CellRuns, other: CellRuns, order: Sequence[int]) -> bool:
     paired = dict(zip(one.finished, (other.finished[seed] for seed in order), strict=True))
     found = metrics.success_difference(one.finished, paired, one.closure or "all", other.closure or "all")
     return found is not None and found.shown
+
+
+def _success_difference(first: CellRuns, second: CellRuns) -> str:
+    """Mean and interval of the difference in S as in the tables, never narrower than the noise of the rounds."""
+    closures = first.closure or "all", second.closure or "all"
+    found = metrics.success_difference(first.finished, second.finished, *closures)
+    if found is None or found.interval is None:
+        return "no seeds in common"
+    mean, low, high = 100 * found.mean, 100 * found.interval.low, 100 * found.interval.high
+    return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def _paired(first: Array, second: Array) -> str:

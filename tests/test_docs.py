@@ -183,17 +183,26 @@ def test_the_drawings_are_those_that_the_script_makes(monkeypatch: pytest.Monkey
         assert (DOCS / "images" / file).read_bytes() == data, f"python docs/drawings.py draws another {file}"
 
 
-def test_the_page_of_the_results_has_the_numbers_that_the_script_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("page", "title", "pattern", "n_numbers"),
+    [
+        ("reproduction.md", "From none to three obstacles", r"-?[\d.]+ \[-?[\d.]+, -?[\d.]+\](?=;)", 4),
+        ("reproduction.md", "Where Eq. 6 fails", r"-?[\d.]+ \[-?[\d.]+, -?[\d.]+\](?=;)", 4),
+        ("reproduction.md", "S minus the paper's", r"(?<=: )[\d.]+", 5),
+        ("reproduction.md", "Processor time", r"[\d.]+(?= hours, [1-9])", 4),
+        ("protocol.md", "Rise of the learning curves", r"(?<=; )(?:[4-9]|\d\d)\.\d", 10),
+        ("protocol.md", "Rise of the calibration's curves", r"[\d.]+(?=, \d+\.)|[\d.]+$", 4),
+    ],
+)
+def test_the_pages_of_the_study_have_the_numbers_that_the_script_finds(
+    page: str, title: str, pattern: str, n_numbers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(DOCS)
     import findings
 
-    page = " ".join((DOCS / "reproduction.md").read_text(encoding="utf-8").split())
-    found = {title.partition(":")[0]: lines for title, lines in findings.findings(findings.read_results()).items()}
-    intervals = [*found["From none to three obstacles, paired by training seed"], *found["Where Eq. 6 fails"]]
-    assert len(intervals) == 4 + 4
-    for line in intervals:
-        [interval] = re.findall(r"(-?[\d.]+ \[-?[\d.]+, -?[\d.]+\]);", line)
-        assert interval in page, line
-    hours = re.findall(r"the study: ([\d.]+) hours", "\n".join(found["Processor time"]))
-    assert len(hours) == 2  # of the runs, and of the former ones
-    assert all(f"{float(number):.1f} hours" in page for number in hours)
+    [lines] = [lines for name, lines in findings.findings(findings.read_results()).items() if name.startswith(title)]
+    numbers = [number for line in lines for number in re.findall(pattern, line)]
+    assert len(numbers) == n_numbers
+    text = " ".join((DOCS / page).read_text(encoding="utf-8").split())
+    for number in numbers:
+        assert (number if "[" in number else f"{float(number):.1f}") in text

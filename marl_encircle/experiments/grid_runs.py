@@ -8,7 +8,7 @@ from marl_encircle.experiments.records import Run, read_runs
 from marl_encircle.experiments.train import check_same_run, run_folder
 
 
-def runs_of(grid: Grid, folder: str | Path) -> list[Run]:
+def read_grid_runs(grid: Grid, folder: str | Path) -> list[Run]:
     """Return the runs of a grid in the order of method, setting, seed.
 
     Other runs in the folder are left out, and rounds in settings in which the grid does not ask to play.

@@ -164,7 +164,7 @@ def _corrected(rows: Iterable[_Row]) -> str:
     for (row, _), is_shown in zip(compared, rejected, strict=True):
         if is_shown:
             shown.setdefault(label(row.cell.method), []).append(row.cell.setting.symbols)
-    names = "; ".join(f"{method} at {' and '.join(settings)}" for method, settings in shown.items())
+    names = ", ".join(f"{method} ({'; '.join(settings)})" for method, settings in shown.items())
     return (
         f"Corrected for all {len(compared)} comparisons of S with an interval, each under the methods' own rules, by"
         f" Holm's procedure, a difference stays shown from {names or 'none'}."

@@ -9,7 +9,7 @@ from marl_encircle.experiments.config import load_config
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.executors import Executor
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.grid_runs import read_grid_runs
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.records import RECORD, Setting, episodes_name, read_record, read_runs
 from marl_encircle.experiments.sweep import Progress, sweep
@@ -113,7 +113,7 @@ def render(grid: Grid, results: str | Path) -> dict[str, str]:
     notes = freeze_notes(grid.frozen, grid.amended)
     texts = render_table1({method: options_of(method) for method in TABLE1_METHODS}, notes)
     folder = Path(results) / "runs"
-    runs, cells = runs_of(grid, folder), grid.cells
+    runs, cells = read_grid_runs(grid, folder), grid.cells
     texts |= render_tables(runs, grid.aliases, cells, notes)
     texts |= render_scenes(runs, notes)
     by_cell = gather(runs, grid.aliases)

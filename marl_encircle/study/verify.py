@@ -1,8 +1,8 @@
 """Are the committed results those of this code? Every policy plays its rounds again, tables and figures are made again.
 
-On the processor that a run was made on every round must be equal in every figure. Another one rounds differently, and a
+On the processor that a run was made on every round must be equal in every number. Another one rounds differently, and a
 round may then take another course: there 99.5 % of the rounds must end alike, every cell's S must lie within the 99 %
-binomial interval of the S that is recorded, and pictures are not compared.
+binomial interval of the S that is recorded, and only figures of recorded numbers are compared.
 """
 
 from collections import Counter, defaultdict
@@ -29,7 +29,7 @@ class Verification(NamedTuple):
     """What was found.
 
     :param rounds: rounds played again
-    :param equal: those that ended as recorded; on the run's own processor also with the same figures
+    :param equal: those that ended as recorded; on the run's own processor also with the same numbers
     :param rounds_here: rounds of runs that were made on this processor
     :param equal_here: those of them that are equal
     :param cells_off: cells whose S lies outside the interval
@@ -56,11 +56,14 @@ class Verification(NamedTuple):
         return self.rounds > 0 and enough and not self.cells_off and not self.changed
 
 
-def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] | None = None) -> Verification:
+def verify(
+    grid: Grid, results: str | Path, report: Callable[[int, int], None] | None = None, *, exact: bool = False
+) -> Verification:
     """Play every finished run of a grid again and make its tables, and its figures if there are any; write nothing.
 
     :param results: folder of ``runs/``, ``tables/`` and ``figures/``
     :param report: called with the number of runs verified and of all
+    :param exact: take every run as made on this processor
     :raises DamagedFileError: if a run is not what its record says
     """
     texts = render(grid, results)  # and with that, whether every run is what its record says
@@ -70,7 +73,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
     successes: dict[tuple[Cell, Setting | None], list[tuple[bool, bool]]] = defaultdict(list)
     for done, folder in enumerate(folders, start=1):
         policy, config, record = load_run(folder)
-        here = record.get("cpu") == cpu_model()
+        here = exact or record.get("cpu") == cpu_model()
         closure = config.reward.closure
         for setting in (None, *grid.elsewhere.get(config.cell, ())):
             name = episodes_name(setting)
@@ -88,10 +91,12 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
             report(done, len(folders))
     off = sum(is_off(*zip(*pairs, strict=True)) for pairs in successes.values())
     contents = {name: text.encode() for name, text in texts.items()}
-    if not rounds[False] and (Path(results) / "figures").is_dir():
-        from marl_encircle.study.figures.write import encode_figures
+    if (Path(results) / "figures").is_dir():
+        from marl_encircle.study.figures.write import COMPUTED, encode_figures
 
-        contents |= encode_figures(grid, results)
+        for name, data in encode_figures(grid, results).items():
+            if not (rounds[False] and Path(name).stem in COMPUTED):
+                contents[name] = data
     changed = [name for name, data in contents.items() if _read(Path(results) / name) != data]
     return Verification(rounds.total(), equal.total(), rounds[True], equal[True], off, tuple(changed))
 
@@ -99,7 +104,7 @@ def verify(grid: Grid, results: str | Path, report: Callable[[int, int], None] |
 def count_equal(recorded: Sequence[Episode], played: Sequence[Episode], exact: bool) -> int:
     """Count the rounds that ended alike.
 
-    :param exact: all figures must be the same, not only the steps at which the closure rules held
+    :param exact: all numbers must be the same, not only the steps at which the closure rules held
     """
     pairs = zip(recorded, played, strict=True)
     if exact:

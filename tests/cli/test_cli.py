@@ -608,7 +608,7 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
     assert (done.code, done.out.splitlines()) == (
         3,
         [
-            "check: every figure of every round",
+            "check: every number of every round, tables and figures",
             f"changed: {table}",
             "rounds=16 equal=16 cells_off=0",
         ],
@@ -620,10 +620,12 @@ def test_reproduction_and_verification_as_json_are_one_object_each(run: Run, tmp
     assert (done.code, done.out.splitlines()) == (
         0,
         [
-            "check: how the rounds end, and every figure where this processor made the run",
+            "check: how every round ends, every number of the runs of this processor, all but Figures 1, 3 and 6",
             "rounds=16 equal=16 cells_off=0",
         ],
     )
+    done = run("verify-results", *results, "--quiet", "--exact")
+    assert (done.code, done.out.splitlines()[0]) == (0, "check: every number of every round, tables and figures")
 
 
 @pytest.mark.usefixtures("_tiny_workers")

@@ -1,3 +1,5 @@
+"""Memory that a training frees stays with its process."""
+
 import subprocess
 import sys
 
@@ -21,7 +23,7 @@ print(given_back, faults())
 """
 
 
-def test_freed_memory_comes_back_without_page_faults():
+def test_freed_memory_comes_back_without_page_faults() -> None:
     printed = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True).stdout
     given_back, kept = map(int, printed.split())
     assert given_back > 2000  # else this C library keeps it anyway, and the function can go

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from tiny_runs import TINY, command, copy_of_finished, finished, tiny
 
 from marl_encircle.experiments.grid import Grid, Job, load_grid
-from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.grid_runs import read_grid_runs
 from marl_encircle.experiments.pretrained import USUAL_SETTING, find_run
 from marl_encircle.experiments.records import Setting, config_hash, read_record, run_path
 from marl_encircle.experiments.train import train
@@ -104,9 +104,11 @@ def test_the_program_on_the_card_of_another_folder_plays_that_policy(
 def test_only_the_first_seed_has_a_card_and_only_when_it_is_finished(tmp_path: Path) -> None:
     grid = Grid((FIRST._replace(seed=5), FIRST), {})
     train(FIRST.config, 5, "native", tmp_path)
-    assert render_cards(grid, runs_of(grid, tmp_path), tmp_path) == {}
+    assert render_cards(grid, read_grid_runs(grid, tmp_path), tmp_path) == {}
     copy_of_finished(tmp_path)
-    assert list(render_cards(grid, runs_of(grid, tmp_path), tmp_path)) == [f"{run_path(FIRST.config.cell, 0)}/{CARD}"]
+    assert list(render_cards(grid, read_grid_runs(grid, tmp_path), tmp_path)) == [
+        f"{run_path(FIRST.config.cell, 0)}/{CARD}"
+    ]
 
 
 def test_cards_are_written_with_the_tables(tmp_path: Path) -> None:
@@ -117,7 +119,7 @@ def test_cards_are_written_with_the_tables(tmp_path: Path) -> None:
 
 def test_every_committed_policy_that_is_found_by_name_has_the_card_that_it_would_get_now() -> None:
     grid = load_grid("study")
-    cards = render_cards(grid, runs_of(grid, RUNS), RUNS)
+    cards = render_cards(grid, read_grid_runs(grid, RUNS), RUNS)
     assert cards == {path.relative_to(RUNS).as_posix(): path.read_text() for path in RUNS.rglob(CARD)}
     found = set()
     for method, setting in grid.cells:

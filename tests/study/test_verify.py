@@ -79,6 +79,12 @@ def test_another_processor_may_round_otherwise_but_not_end_otherwise(
     assert not found.passed  # one of eight is more than 0.5 %
 
 
+def test_every_number_can_be_asked_for_on_another_processor_too(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verification, "cpu_model", lambda: "another")
+    change_a_round(results, return_mean=0.125)
+    assert verify(GRID, results, exact=True) == Verification(8, 7, 8, 7, cells_off=0, changed=())
+
+
 def test_a_run_of_another_processor_excuses_no_round_of_this_one(results: Path) -> None:
     job = Job("ours", Setting(1.1, 3, 1), 1, "smoke", overrides=TINY)
     grid = Grid((*GRID.jobs, job), {})
@@ -108,6 +114,16 @@ def test_a_figure_that_the_runs_do_not_give_is_found(results: Path) -> None:
     picture.write_bytes(picture.read_bytes().replace(b"success", b"failure", 1))
     (results / "figures" / "figure6.png").unlink()
     assert set(verify(GRID, results).changed) == {"figures/figure4.svg", "figures/figure6.png"}
+
+
+def test_on_another_processor_only_figures_that_are_computed_anew_may_differ(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verification, "cpu_model", lambda: "another")
+    write_figures(GRID, results)
+    for name in ("figure1", "figure4", "figure6"):
+        (results / "figures" / f"{name}.svg").write_text("another")
+    assert verify(GRID, results).changed == ("figures/figure4.svg",)
 
 
 def test_nothing_is_no_proof(tmp_path: Path) -> None:

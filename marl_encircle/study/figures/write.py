@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from marl_encircle import files
 from marl_encircle.experiments.evaluate import play_rounds
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.grid_runs import read_grid_runs
 from marl_encircle.experiments.learning_curve import Curve, read_curve
 from marl_encircle.experiments.loading import load_run
 from marl_encircle.experiments.metrics import CellSummary, summarise_cell
@@ -22,6 +22,9 @@ from marl_encircle.study.figures.contributions import draw_figure5
 from marl_encircle.study.figures.curves import Band, band_of, draw_figure4, in_order
 from marl_encircle.study.figures.rounds import METHOD, PLACES, Column, Place, choose_round, draw_figure6
 from marl_encircle.study.figures.situations import draw_figure1, draw_figure3
+
+COMPUTED = frozenset({"figure1", "figure3", "figure6"})
+"""Figures of geometry or rounds that are computed when they are drawn; the others show recorded numbers alone."""
 
 
 def write_figures(grid: Grid, results: str | Path) -> list[Path]:
@@ -52,7 +55,7 @@ def draw_figures(grid: Grid, folder: Path) -> dict[str, Figure]:
 
     :param folder: of all runs
     """
-    runs = runs_of(grid, folder)
+    runs = read_grid_runs(grid, folder)
     bands = read_bands([run for run in runs if run.cell.setting in curves.SETTINGS], folder)
     by_cell = gather(runs, grid.aliases)
     absent = absences(by_cell)

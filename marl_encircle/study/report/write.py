@@ -7,7 +7,7 @@ from typing import NamedTuple
 from marl_encircle import files
 from marl_encircle.experiments.config import difference
 from marl_encircle.experiments.grid import Grid
-from marl_encircle.experiments.grid_runs import runs_of
+from marl_encircle.experiments.grid_runs import read_grid_runs
 from marl_encircle.experiments.loading import config_of
 from marl_encircle.experiments.records import RECORD, Cell, Run, read_record, read_runs, run_path
 from marl_encircle.experiments.yaml_files import ConfigError
@@ -62,7 +62,7 @@ class _Shown(NamedTuple):
 
 
 def _of_grid(grid: Grid, folder: Path) -> _Shown:
-    runs = runs_of(grid, folder)
+    runs = read_grid_runs(grid, folder)
     facts = _facts(runs, len(grid.jobs), {job.seed for job in grid.jobs})
     if grid.frozen is not None:
         facts.append(("recipe frozen in", grid.frozen[:12]))
