@@ -76,7 +76,7 @@ def test_what_stays_shown_when_all_comparisons_are_taken_together_is_named() -> 
         return [finished(method, ONE, seed, successes) for seed, successes in enumerate((85, 82, 79))]
 
     end = "by Holm's procedure, a difference stays shown from"
-    assert f"{end} Model A at ratio 1.1, n=3, m=1.\n" in differences(ours + near("model_a"))
+    assert f"{end} Model A (ratio 1.1, n=3, m=1).\n" in differences(ours + near("model_a"))
     both = differences(ours + near("model_a") + near("model_b"))
     assert ": higher" in markdown_row(both, "Model A", *THREE)[1]
     assert "Corrected for all 2 comparisons" in both
