@@ -14,6 +14,9 @@ import pytest
 from documents import NOT_RUN, PAGES, ROOT, Session, blocks_of, lines_of, small
 from filelock import FileLock
 from PIL import Image
+from tiny_runs import copy_of_finished
+
+from marl_encircle import files
 
 __all__ = ["small"]
 
@@ -206,3 +209,23 @@ def test_the_pages_of_the_study_have_the_numbers_that_the_script_finds(
     text = " ".join((DOCS / page).read_text(encoding="utf-8").split())
     for number in numbers:
         assert (number if "[" in number else f"{float(number):.1f}") in text
+
+
+def test_a_training_that_was_made_again_is_compared_file_by_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(DOCS)
+    import trained_again
+
+    for name in ("runs", "again"):
+        copy_of_finished(tmp_path / name)
+    monkeypatch.setattr(trained_again, "RESULTS", tmp_path)
+    [row] = trained_again.compare(tmp_path / "again")
+    assert (row["run"], row["same"]) == ("ours/ratio1.1_n3_m1_random/seed0", "True")
+    record = tmp_path / "again" / row["run"] / "run.json"
+    content = json.loads(record.read_text())
+    for changed in ({"policy.safetensors": "0" * 64}, {"episodes_ratio1.1_n3_m1_tunnel.csv": "0" * 64}):
+        files.write_json(record, {**content, "sha256": content["sha256"] | changed})
+        assert [row["same"] for row in trained_again.compare(tmp_path / "again")] == ["False"]
+    record.unlink()
+    assert trained_again.compare(tmp_path / "again") == []
