@@ -73,7 +73,8 @@ def test_the_same_seed_gives_the_same_bytes(out: Path, tmp_path: Path, circumsta
 
 def test_tables_and_figures_can_be_derived_again(out: Path, tmp_path: Path, promise: Any) -> None:
     shutil.copytree(out / "runs", tmp_path / "swept" / "runs")
-    shutil.copytree(ROOT / "results" / "runs", tmp_path / "committed" / "runs")
+    for name in ("runs", "former"):
+        shutil.copytree(ROOT / "results" / name, tmp_path / "committed" / name)
     for command in DERIVED:
         marl_encircle(tmp_path, command, "--grid", out.parent / "grid.yaml", "--out", tmp_path / "swept")
     marl_encircle(tmp_path, "tables", "--grid", "study", "--out", tmp_path / "committed")

@@ -18,7 +18,7 @@ shared: []
 """
 RUN = "runs/ours/ratio1.1_n3_m1_random/seed0"
 SWEPT = ["--grid", "grid.yaml", "--out", "swept"]
-HIDDEN = "tensorboard torch.utils.tensorboard pygame PIL imageio imageio_ffmpeg onnx onnxruntime ray optuna"
+HIDDEN = "tensorboard torch.utils.tensorboard pygame imageio imageio_ffmpeg onnx onnxruntime ray optuna"
 REFUSALS = {
     "train": ([*tiny_arguments("--out", "other", "--quiet")], "pip install 'tensorboard"),
     "watch": ([RUN, "--headless", "pictures"], "pip install 'marl-encircle[render]'"),
