@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from marl_encircle.drawing.palette import SERIES, Series
@@ -140,4 +141,5 @@ def _arrange(axes: Axes) -> None:
     axes.set(ylim=(-2, 102), yticks=range(0, 101, 20), xlabel="training [million world steps]")
     axes.margins(x=0.01)
     axes.set_xlim(left=0.0)
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))  # neighbours' labels would meet with more
     axes.grid(axis="y")
