@@ -508,6 +508,9 @@ def test_verification_of_nothing_ends_with_3(run: Run, tmp_path: Path) -> None:
     done = run("verify-results", "--grid", "smoke", "--out", tmp_path, "--quiet")
     assert (done.code, done.out) == (3, "")
     assert done.err == f"nothing was verified: {tmp_path}/runs has no finished run of the grid smoke\n"
+    done = run("verify-results", "--grid", "smoke", "--out", tmp_path, "--quiet", "--json")
+    found = json.loads(done.out)
+    assert (done.code, found["passed"], found["rounds"]) == (3, False, 0)
 
 
 # sweep, tables, reproduce-tables

@@ -17,7 +17,6 @@ def faults():
 faults()
 given_back = faults()
 keep_freed_memory()
-
 faults()
 print(given_back, faults())
 """
