@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parents[1] / "results"
 STUDY = (*TABLE_METHODS, "model_c")
-GROUPS = {"the study": STUDY, "Ours+": ("ours_plus",), "the one policy": ("generalist",)}
 CHOSEN = RESULTS / "calibration" / "runs" / "turn_order=simultaneous,acceleration=3"
 FORMER_ROUNDS = RESULTS / "former" / "rounds_of_seed_1000.csv"
 
@@ -204,27 +203,26 @@ def _pairings(results: Results) -> Iterator[str]:
 
 
 def _hours(_: Results) -> Iterator[str]:
+    groups = {"the study": STUDY, "Ours+": ("ours_plus",), "the one policy": ("generalist",)}
     for folder in ("runs", "former"):
         records = [read_record(path.parent) for path in sorted((RESULTS / folder).glob("*/*/*/run.json"))]
-        for name, methods in GROUPS.items():
+        for name, methods in groups.items():
             hours = [record["cpu_seconds"] / 3600 for record in records if record["method"] in methods]
             yield f"{folder}, {name}: {sum(hours):.2f} hours, {len(hours)} runs"
 
 
 def _again(_: Results) -> Iterator[str]:
-    for name, methods in GROUPS.items():
-        rows = [row for row in trained_again.read() if row["run"].split("/")[0] in methods]
-        if not rows:
-            continue
-        seconds: dict[Path, list[float]] = defaultdict(list)
-        for row in rows:
-            seconds[(RESULTS / "runs" / row["run"]).parent].append(float(row["cpu_seconds"]))
-        now = sum(map(sum, seconds.values())) / 3600
-        first = sum(float(row["recorded_cpu_seconds"]) for row in rows) / 3600
-        every = sum(len(list(cell.glob("seed*"))) * float(np.mean(found)) for cell, found in seconds.items()) / 3600
-        n_same = sum(row["same"] == "True" for row in rows)
-        yield f"{name}: {len(rows)} runs, {n_same} the same; {now:.2f} hours, {first:.2f} the first time"
-        yield f"{name}: {every:.2f} hours at this rate for all seeds of these {len(seconds)} cells"
+    rows = trained_again.read()
+    yield f"of {len(rows)} runs {sum(row['same'] == 'True' for row in rows)} came out the same"
+    study = [row for row in rows if row["run"].split("/")[0] in STUDY]
+    hours: dict[Path, list[float]] = defaultdict(list)
+    for row in study:
+        hours[(RESULTS / "runs" / row["run"]).parent].append(float(row["cpu_seconds"]) / 3600)
+    first = sum(float(row["recorded_cpu_seconds"]) / 3600 for row in study)
+    yield f"{len(study)} of the study: {sum(map(sum, hours.values())):.3f} hours, the first time {first:.3f} hours"
+    n_runs = {cell: len(list(cell.glob("seed*"))) for cell in hours}
+    every = sum(n_runs[cell] * float(np.mean(found)) for cell, found in hours.items())
+    yield f"all {sum(n_runs.values())} runs of these {len(hours)} cells at this rate: {every:.3f} hours"
 
 
 _SECTIONS: dict[str, Callable[[Results], Iterator[str]]] = {
