@@ -74,6 +74,11 @@ def _seeds(results: Results) -> Iterator[str]:
         yield f"{_named(cell)}: {successes.mean():.2f} of {_listed(successes)}; {_listed(lengths)}"
 
 
+def _former_seeds(results: Results) -> Iterator[str]:
+    for cell, runs in gather(results.former, {}).items():
+        yield f"{_named(cell)}: {_listed(_successes(runs))}"
+
+
 def _losses(results: Results) -> Iterator[str]:
     for method in TABLE_METHODS:
         none, three = (results.cells[Cell(method, Setting(1.1, 3, m))] for m in (0, 3))
@@ -212,36 +217,21 @@ def _hours(_: Results) -> Iterator[str]:
 
 
 def _again(_: Results) -> Iterator[str]:
-    rows = trained_again.read()
+    rows = trained_again.found()
     yield f"of {len(rows)} runs {sum(row['same'] == 'True' for row in rows)} came out the same"
     study = [row for row in rows if row["run"].split("/")[0] in STUDY]
-    hours: dict[Path, list[float]] = defaultdict(list)
-    for row in study:
-        hours[(RESULTS / "runs" / row["run"]).parent].append(float(row["cpu_seconds"]) / 3600)
-    first = sum(float(row["recorded_cpu_seconds"]) / 3600 for row in study)
-    yield f"{len(study)} of the study: {sum(map(sum, hours.values())):.3f} hours, the first time {first:.3f} hours"
-    n_runs = {cell: len(list(cell.glob("seed*"))) for cell in hours}
-    every = sum(n_runs[cell] * float(np.mean(found)) for cell, found in hours.items())
-    yield f"all {sum(n_runs.values())} runs of these {len(hours)} cells at this rate: {every:.3f} hours"
+    again, first = _cpu_hours(study)
+    yield f"{len(study)} of the study: {again:.3f} hours, the first time {first:.3f} hours"
+    for commit in sorted({row["git_commit"] for row in study}):
+        batch = [row for row in study if row["git_commit"] == commit]
+        again, first = _cpu_hours(batch)
+        yield f"{len(batch)} with {commit[:7]}: {again / first:.2f} times the first"
 
 
-_SECTIONS: dict[str, Callable[[Results], Iterator[str]]] = {
-    "S and MEL of every training seed": _seeds,
-    "From none to three obstacles, paired by training seed: loss in S; MEL with none and with three": _losses,
-    "What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1": _counting,
-    "Wins of Ours at ratio 1.1, m=1, in which the circle closed first with the obstacle; never without": _help,
-    "Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval": _slowness,
-    "Rise of the learning curves over the last two fifths, over the last two tenths; before the amendment": _rises,
-    "Rise of the calibration's curves in the chosen scenario over the last two fifths, each seed's": _calibration,
-    "S on the rounds of seed 4000 minus that on those of seed 1000: mean of the amounts, mean; largest": _former_rounds,
-    "Million world-steps until the mean curve has 80 %; the same without the latest seed": _speed,
-    "Other shapes of obstacles: S of Model B, Ours, Ours+; Ours+ minus Ours; Ours with half the budget, since": _scenes,
-    "S minus the paper's, held-out cells unless said: mean of the amounts, mean": _nearness,
-    "Where Eq. 6 holds: how far a difference is from the paper's; can the noise of both be why": _distances,
-    "Differences in S that some of the 120 pairings of seeds show: do the tables, how many do; Welch": _pairings,
-    "Processor time": _hours,
-    "Runs that were trained again: processor time now and the first time": _again,
-}
+def _cpu_hours(rows: Sequence[Mapping[str, str]]) -> tuple[float, float]:
+    """Processor time of runs that were trained again, and of the first time."""
+    again, first = (sum(float(row[name]) for row in rows) for name in ("cpu_seconds", "recorded_cpu_seconds"))
+    return again / 3600, first / 3600
 
 
 def _own(results: Results) -> Iterator[tuple[Cell, CellRuns]]:
@@ -320,6 +310,25 @@ def _named(cell: Cell) -> str:
 def _listed(values: Array) -> str:
     return ", ".join(f"{value:.1f}" for value in values)
 
+
+_SECTIONS: dict[str, Callable[[Results], Iterator[str]]] = {
+    "S and MEL of every training seed": _seeds,
+    "S of every training seed after half the budget, where it was amended": _former_seeds,
+    "From none to three obstacles, paired by training seed: loss in S; MEL with none and with three": _losses,
+    "What counting the obstacles adds to S of Ma and Model A, three pursuers at ratio 1.1": _counting,
+    "Wins of Ours at ratio 1.1, m=1, in which the circle closed first with the obstacle; never without": _help,
+    "Where Eq. 6 fails: MEL of Ours minus that of Model B, each over its own wins; Welch's interval": _slowness,
+    "Rise of the learning curves over the last two fifths, over the last two tenths; before the amendment": _rises,
+    "Rise of the calibration's curves in the chosen scenario over the last two fifths, each seed's": _calibration,
+    "S on the rounds of seed 4000 minus that on those of seed 1000: mean of the amounts, mean; largest": _former_rounds,
+    "Million world-steps until the mean curve has 80 %; the same without the latest seed": _speed,
+    "Other shapes of obstacles: S of Model B, Ours, Ours+; Ours+ minus Ours; Ours with half the budget, since": _scenes,
+    "S minus the paper's, held-out cells unless said: mean of the amounts, mean": _nearness,
+    "Where Eq. 6 holds: how far a difference is from the paper's; can the noise of both be why": _distances,
+    "Differences in S that some of the 120 pairings of seeds show: do the tables, how many do; Welch": _pairings,
+    "Processor time": _hours,
+    "Runs that were trained again: processor time now and the first time": _again,
+}
 
 if __name__ == "__main__":
     main()

@@ -2,27 +2,30 @@
 
 marl-encircle sweep study --out FOLDER
 python docs/trained_again.py FOLDER
+
+What stands in the file stays: neither a difference nor a slow run goes away when somebody trains once more.
 """
 
 import csv
 import io
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from marl_encircle import files
-from marl_encircle.experiments.records import RECORD, read_record, run_folders
+from marl_encircle.experiments.records import CURVE, POLICY, episodes_name, read_record, read_runs, run_path
 
 RESULTS = Path(__file__).parents[1] / "results"
 FOUND = RESULTS / "trained_again.csv"
+WRITTEN = (POLICY, CURVE, episodes_name())
 
 
 def main() -> None:
     """Compare the runs of the folder that is named, and say how many are the same."""
     if len(sys.argv) != 2:
         raise SystemExit(__doc__)
-    rows = {row["run"]: row for row in read()}
-    rows |= {row["run"]: row for row in compare(Path(sys.argv[1]))}
+    rows = {row["run"]: row for row in (*compared(Path(sys.argv[1])), *found())}
     if not rows:
         raise SystemExit(f"no run in {sys.argv[1]} has ended and has one of its name in {RESULTS / 'runs'}")
     text = io.StringIO()
@@ -33,24 +36,30 @@ def main() -> None:
     sys.stdout.write(f"runs={len(rows)} same={sum(row['same'] == 'True' for row in rows.values())}\n")
 
 
-def read() -> list[dict[str, str]]:
+def found() -> list[dict[str, str]]:
     """Return what was found until now, a row for each run."""
     return list(csv.DictReader(FOUND.read_text().splitlines())) if FOUND.exists() else []
 
 
-def compare(folder: Path) -> list[dict[str, str]]:
-    """Return a row for each run in a folder that has ended, and has one of its name in ``results/runs``."""
-    rows = []
-    for path in run_folders(folder):
-        run = path.relative_to(folder)
-        if (path / RECORD).exists() and (RESULTS / "runs" / run / RECORD).exists():
-            rows.append(_row(run, read_record(path), read_record(RESULTS / "runs" / run)))
-    return rows
+def compared(folder: Path) -> Iterator[dict[str, str]]:
+    """Compare each ended run of a folder with that of its name in ``results/runs``; copies of that are passed over.
+
+    :param folder: the runs, as a sweep writes them
+    :return: a row for each
+    :raises files.DamagedFileError: for a file that is not what its run wrote, by name
+    """
+    for run in read_runs(folder):
+        path = run_path(run.cell, run.seed)
+        if run.status != "unfinished" and (RESULTS / "runs" / path).exists():
+            again, recorded = read_record(folder / path), read_record(RESULTS / "runs" / path)
+            if again["cpu_seconds"] != recorded["cpu_seconds"]:
+                yield _row(path, again, recorded)
 
 
 def _row(run: Path, again: dict[str, Any], recorded: dict[str, Any]) -> dict[str, str]:
-    """Compare two records: policy, learning curve, and the rounds that both played, byte for byte."""
-    same = all(recorded["sha256"].get(name) == value for name, value in again["sha256"].items())
+    """Compare two records: configuration, and by their hashes policy, learning curve, rounds and whatever else."""
+    names = {*WRITTEN, *again["sha256"]}
+    same = all(again["sha256"].get(name) == recorded["sha256"].get(name) for name in names)
     return {
         "run": run.as_posix(),
         "same": str(same and again["config_hash"] == recorded["config_hash"]),

@@ -1,6 +1,8 @@
 """How the rounds end that a policy loses: how much of the circle is taken, and where the bodies are.
 
 python examples/lost_rounds.py results/runs/model_c/ratio1.1_n3_m1_random/seed*
+
+Rounds are played again: on another type of processor than the runs' the last digit may differ (docs/reproduce.md).
 """
 
 import csv

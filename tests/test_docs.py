@@ -14,9 +14,6 @@ import pytest
 from documents import NOT_RUN, PAGES, ROOT, Session, blocks_of, lines_of, small
 from filelock import FileLock
 from PIL import Image
-from tiny_runs import copy_of_finished
-
-from marl_encircle import files
 
 __all__ = ["small"]
 
@@ -193,7 +190,7 @@ def test_the_drawings_are_those_that_the_script_makes(monkeypatch: pytest.Monkey
         ("reproduction.md", "Where Eq. 6 fails", r"-?[\d.]+ \[-?[\d.]+, -?[\d.]+\](?=;)", 4),
         ("reproduction.md", "S minus the paper's", r"(?<=: )[\d.]+", 5),
         ("reproduction.md", "Processor time", r"[\d.]+(?= hours, [1-9])", 4),
-        ("reproduction.md", "Runs that were trained again", r"[\d.]+(?= hours)", 3),
+        ("reproduction.md", "Runs that were trained again", r"[\d.]+(?= hours| times)", 5),
         ("protocol.md", "Rise of the learning curves", r"(?<=; )(?:[4-9]|\d\d)\.\d", 10),
         ("protocol.md", "Rise of the calibration's curves", r"[\d.]+(?=, \d+\.)|[\d.]+$", 4),
     ],
@@ -209,24 +206,5 @@ def test_the_pages_of_the_study_have_the_numbers_that_the_script_finds(
     assert len(numbers) == n_numbers
     text = " ".join((DOCS / page).read_text(encoding="utf-8").split())
     for number in numbers:
-        assert (number if "[" in number else f"{float(number):.1f}") in text
-
-
-def test_a_training_that_was_made_again_is_compared_file_by_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(DOCS)
-    import trained_again
-
-    for name in ("runs", "again"):
-        copy_of_finished(tmp_path / name)
-    monkeypatch.setattr(trained_again, "RESULTS", tmp_path)
-    [row] = trained_again.compare(tmp_path / "again")
-    assert (row["run"], row["same"]) == ("ours/ratio1.1_n3_m1_random/seed0", "True")
-    record = tmp_path / "again" / row["run"] / "run.json"
-    content = json.loads(record.read_text())
-    for changed in ({"policy.safetensors": "0" * 64}, {"episodes_ratio1.1_n3_m1_tunnel.csv": "0" * 64}):
-        files.write_json(record, {**content, "sha256": content["sha256"] | changed})
-        assert [row["same"] for row in trained_again.compare(tmp_path / "again")] == ["False"]
-    record.unlink()
-    assert trained_again.compare(tmp_path / "again") == []
+        shown = number if "[" in number else f"{float(number):.1f}"
+        assert re.search(rf"(?<![\d.]){re.escape(shown)}(?!\.?\d)", text), shown
