@@ -83,6 +83,9 @@ def _with_worlds(overrides: Sequence[str], n_worlds: int) -> Sequence[str]:
 def build_vec_env(config: Config, n_worlds: int, engine: Engine = "native", *, curriculum: bool = True) -> VecEnv:
     """Return the environment that a configuration trains in.
 
+    :param n_worlds: worlds side by side, a slot for each pursuer of each
+    :param engine: ``native`` steps all worlds at once, ``supersuit`` the PettingZoo environment world by world
+    :param curriculum: whether the scenario starts easier, as the training's curriculum says
     :raises ConfigError: for an unknown engine, or a curriculum that starts where the scene is not allowed
     """
     check_engine(engine, config)

@@ -50,8 +50,10 @@ def reproduce(
     """Fill ``results/runs`` with the runs of a grid and ``results/tables`` with its tables.
 
     A run whose own rounds had to be played again counts as evaluated, not as reused. Where every run failed no table
-    is written. Arguments are those of ``sweep``.
+    is written.
 
+    :param results: gets ``runs``, ``tables`` and the policies' cards
+    :param n_workers: runs at a time; this, ``report`` and ``executor`` are those of ``sweep``
     :raises DamagedFileError: if a run there is not what its record says
     """
     runs = Path(results) / "runs"

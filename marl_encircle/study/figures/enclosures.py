@@ -52,7 +52,10 @@ def draw_obstacles(axes: Axes, discs: Array) -> None:
 
 
 def draw_enclosure(axes: Axes, moment: Snapshot, linewidth: float = 1.0) -> None:
-    """Tint what the target can reach in the colours of who meets it there; outline it once closed; draw the arcs."""
+    """Tint what the target can reach in the colours of who meets it there; outline it once closed; draw the arcs.
+
+    :param linewidth: of the outline [points]
+    """
     n = len(moment.pursuers)
     for wedge in wedges(moment.owner, moment.distance, moment.closed):
         outline = np.vstack([moment.target, polar(moment.target, wedge.angles, wedge.distances)])
@@ -66,7 +69,10 @@ def draw_enclosure(axes: Axes, moment: Snapshot, linewidth: float = 1.0) -> None
 
 
 def draw_arcs(axes: Axes, moment: Snapshot, linewidth: float) -> None:
-    """Draw the part of each Apollonius circle that faces the target."""
+    """Draw the part of each Apollonius circle that faces the target.
+
+    :param linewidth: of the arcs [points]
+    """
     for i, offset in enumerate(moment.pursuers - moment.target):
         if np.hypot(*offset) > 0.0:
             arc = polar(moment.target, *facing_arc(offset, moment.speed_ratio))
@@ -74,7 +80,11 @@ def draw_arcs(axes: Axes, moment: Snapshot, linewidth: float) -> None:
 
 
 def draw_ring(axes: Axes, moment: Snapshot, inner: float, outer: float) -> None:
-    """Draw a ring around the target whose segments, the contributing angles, have the colours of their owners."""
+    """Draw a ring around the target whose segments, the contributing angles, have the colours of their owners.
+
+    :param inner: its inner radius [scene units]
+    :param outer: its outer radius [scene units]
+    """
     for owner, directions in stretches(moment.owner):
         if owner == NOBODY:
             continue
@@ -95,7 +105,10 @@ def draw_ring(axes: Axes, moment: Snapshot, inner: float, outer: float) -> None:
 
 
 def draw_gaps(axes: Axes, moment: Snapshot, length: float) -> None:
-    """Draw an arrow through the middle of every gap, and the gap itself."""
+    """Draw an arrow through the middle of every gap, and the gap itself.
+
+    :param length: how far from the target the gap is shown [scene units]
+    """
     for owner, directions in stretches(moment.owner):
         if owner != NOBODY:
             continue
