@@ -93,8 +93,9 @@ def test_what_was_found_stays(script: Any, repeat: Path, monkeypatch: pytest.Mon
 def test_the_trainings_of_the_study_came_out_the_same() -> None:
     with (ROOT / "results" / "trained_again.csv").open(newline="") as file:
         rows = {row["run"]: row for row in csv.DictReader(file)}
-    study = {str(run_path(job.config.cell, job.seed)) for job in load_grid("study").jobs}
-    assert set(rows) <= study
+    runs = {run_path(job.config.cell, job.seed).as_posix() for job in load_grid("study").jobs}
+    study = {run for run in runs if not run.startswith(("ours_plus", "generalist"))}
+    assert (len(study), study <= set(rows) <= runs) == (183, True)
     for run, row in rows.items():
         assert row["same"] == "True", run
         recorded = read_record(ROOT / "results" / "runs" / run)["cpu_seconds"]
